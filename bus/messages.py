@@ -1,0 +1,256 @@
+"""Every message that crosses the bus, and nothing else.
+
+Arrays are numpy arrays (read-only views after decoding). Poses are 4x4 float64 `cam_from_object`
+matrices in OpenCV camera axes; lengths are in the field's unit; times are nanoseconds since the epoch.
+Each type checks its own shapes when it is made, on the sending and on the receiving side alike.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Any, ClassVar, Literal
+
+import msgspec
+import numpy as np
+
+
+class Reason(StrEnum):
+    """Why a stage could not do its work; `OK` where it could."""
+
+    OK = "ok"
+    FRAME_MISSING = "frame_missing"
+    FRAME_UNREADABLE = "frame_unreadable"
+    NOTHING_IN_VIEW = "nothing_in_view"
+    TOO_FEW_MATCHES = "too_few_matches"
+    TOO_FEW_CONSISTENT_POINTS = "too_few_consistent_points"
+    NO_CONSENSUS = "no_consensus"
+    IMPLAUSIBLE_POSE = "implausible_pose"
+    INTERNAL_ERROR = "internal_error"
+
+
+class GuessReason(StrEnum):
+    """Where the pose that is rendered next comes from."""
+
+    PRIOR = "prior"
+    MOTION = "motion"
+    KEYFRAME = "keyframe"
+    RELOCALISATION = "relocalisation"
+    NEXT_PASS = "next_pass"
+
+
+class TrackingState(StrEnum):
+    INITIALIZING = "initializing"
+    TRACKING = "tracking"
+    LIMITED = "limited"
+    LOST = "lost"
+
+
+class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Pinhole intrinsics in pixels, pixel (0, 0) at the centre of the top-left pixel; OpenCV k1 k2 p1 p2 k3."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if not np.all(np.isfinite(numbers)):
+            raise ValueError("camera: intrinsics and distortion must be finite")
+        if not (0 < self.width <= 16384 and 0 < self.height <= 16384 and self.fx > 0 and self.fy > 0):
+            raise ValueError("camera: width, height (1 to 16384), fx and fy must be positive")
+
+
+class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """`sequence` counts from 0 per (source, topic), so that a receiver sees what it missed."""
+
+    source: str
+    sequence: int
+    frame_id: int
+    pass_index: int
+    capture_ns: int
+    sent_ns: int
+
+
+class Message(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
+    """Base of all messages; `_arrays` maps a field to its (dtype, shape), None where any length will do."""
+
+    _arrays: ClassVar[dict[str, tuple[str, tuple[int | None, ...]]]] = {}
+
+    header: Header
+
+    def __post_init__(self) -> None:
+        for name, (dtype, shape) in self._arrays.items():
+            check_array(name, getattr(self, name), dtype, shape)
+
+
+def check_array(name: str, value: Any, dtype: str, shape: tuple[int | None, ...]) -> None:
+    """Raise ValueError unless `value` is None or an array of that dtype and shape without NaN or infinity."""
+    if value is None:
+        return
+    if value.dtype != np.dtype(dtype):
+        raise ValueError(f"{name}: dtype {value.dtype} where {dtype} is expected")
+    if value.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, value.shape, strict=True)):
+        raise ValueError(f"{name}: shape {value.shape} where {shape} is expected")
+    if value.dtype.kind == "f" and not np.all(np.isfinite(value)):
+        raise ValueError(f"{name}: not finite")
+
+
+POSE = ("float64", (4, 4))
+COVARIANCE = ("float64", (6, 6))
+
+
+class Frame(Message, kw_only=True):
+    """A camera image: `rgb8` is (height, width, 3), `jpeg` and `png` are the (n,) bytes of the file."""
+
+    image: np.ndarray
+    encoding: Literal["rgb8", "jpeg", "png"]
+    camera: CameraModel
+
+    def __post_init__(self) -> None:
+        shape = (self.camera.height, self.camera.width, 3) if self.encoding == "rgb8" else (None,)
+        check_array("image", self.image, "uint8", shape)
+
+
+class Truth(Message, kw_only=True):
+    """The true pose of a frame, where a dataset or a recording knows it; None where the object is out of view."""
+
+    cam_from_object: np.ndarray | None
+    _arrays: ClassVar = {"cam_from_object": POSE}
+
+
+class Guess(Message, kw_only=True):
+    """The pose to render for an admitted frame, and the camera that the frame was taken with."""
+
+    reason: GuessReason
+    cam_from_object: np.ndarray
+    camera: CameraModel
+    _arrays: ClassVar = {"cam_from_object": POSE}
+
+
+class View(Message, kw_only=True):
+    """The field rendered at `cam_from_object`; depth is along the optical axis, 0 where nothing was hit.
+
+    Renders reused for another guess keep their `view_id`. `camera` has no distortion.
+    """
+
+    ok: bool
+    reason: Reason
+    view_id: str
+    cam_from_object: np.ndarray
+    camera: CameraModel
+    rgb: np.ndarray
+    depth: np.ndarray
+    opacity: np.ndarray
+    _arrays: ClassVar = {
+        "cam_from_object": POSE,
+        "rgb": ("uint8", (None, None, 3)),
+        "depth": ("float32", (None, None)),
+        "opacity": ("uint8", (None, None)),
+    }
+
+
+class Matches(Message, kw_only=True):
+    """Pixels of the view and of the frame that show the same surface point; confidence in 0..1."""
+
+    ok: bool
+    reason: Reason
+    view_id: str
+    pixels_in_view: np.ndarray
+    pixels_in_frame: np.ndarray
+    confidence: np.ndarray
+    _arrays: ClassVar = {
+        "pixels_in_view": ("float32", (None, 2)),
+        "pixels_in_frame": ("float32", (None, 2)),
+        "confidence": ("float32", (None,)),
+    }
+
+
+class Correspondences(Message, kw_only=True):
+    """Matches lifted to the object: `consistency` is the paper's m in squared field units; `kept` those below gamma."""
+
+    ok: bool
+    reason: Reason
+    camera: CameraModel
+    guess_cam_from_object: np.ndarray
+    pixels_in_frame: np.ndarray
+    points_in_object: np.ndarray
+    confidence: np.ndarray
+    consistency: np.ndarray
+    kept: np.ndarray
+    _arrays: ClassVar = {
+        "guess_cam_from_object": POSE,
+        "pixels_in_frame": ("float32", (None, 2)),
+        "points_in_object": ("float32", (None, 3)),
+        "confidence": ("float32", (None,)),
+        "consistency": ("float32", (None,)),
+        "kept": ("bool", (None,)),
+    }
+
+
+class Estimate(Message, kw_only=True):
+    """The pose of one PnP; the covariance is of a left twist (translation, rotation) in the camera frame."""
+
+    ok: bool
+    reason: Reason
+    cam_from_object: np.ndarray | None
+    covariance: np.ndarray | None
+    camera: CameraModel
+    inliers_in_frame: np.ndarray
+    correspondences: int
+    residual_px: float | None
+    _arrays: ClassVar = {
+        "cam_from_object": POSE,
+        "covariance": COVARIANCE,
+        "inliers_in_frame": ("float32", (None, 2)),
+    }
+
+
+class Pose(Message, kw_only=True):
+    """The result for a frame and pass: the estimate, or its refinement where that made the loss smaller."""
+
+    ok: bool
+    reason: Reason
+    cam_from_object: np.ndarray | None
+    covariance: np.ndarray | None
+    inliers: int
+    correspondences: int
+    residual_px: float | None
+    refined: bool
+    loss_before: float | None
+    loss_after: float | None
+    _arrays: ClassVar = {"cam_from_object": POSE, "covariance": COVARIANCE}
+
+
+class State(Message, kw_only=True):
+    """What tracking believes after each frame, and what it has counted at its door since it started."""
+
+    state: TrackingState
+    score: float
+    cam_from_object: np.ndarray | None
+    covariance: np.ndarray | None
+    in_flight: int
+    admitted: int
+    finished: int
+    dropped_at_the_door: int
+    lost: int
+    _arrays: ClassVar = {"cam_from_object": POSE, "covariance": COVARIANCE}
+
+
+class Stats(Message, kw_only=True):
+    """Counters of one process since it started; sent from its main loop, so that it is the heartbeat as well."""
+
+    stage: str
+    ready: bool
+    received: int
+    published: int
+    refused: int
+    gaps: int
+    failed: int
+    busy_ms_p50: float
+    busy_ms_p90: float
+    cpu_s: float
+    rss_mb: float

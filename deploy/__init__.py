@@ -1,0 +1,1 @@
+"""The command line, the process table and the supervision of the processes."""

@@ -1,0 +1,35 @@
+"""Cameras, rigid transforms, pose errors and random poses: what every stage shares."""
+
+from stages.geometry.cameras import Camera, rays
+from stages.geometry.errors import rotation_error_deg, translation_error
+from stages.geometry.rigid import (
+    adjoint,
+    camera_centre,
+    exp_se3,
+    interpolate,
+    inverse,
+    is_rigid,
+    log_se3,
+    look_at,
+    nearest_rigid,
+    rotation_about,
+)
+from stages.geometry.sampling import perturb
+
+__all__ = [
+    "Camera",
+    "adjoint",
+    "camera_centre",
+    "exp_se3",
+    "interpolate",
+    "inverse",
+    "is_rigid",
+    "log_se3",
+    "look_at",
+    "nearest_rigid",
+    "perturb",
+    "rays",
+    "rotation_about",
+    "rotation_error_deg",
+    "translation_error",
+]

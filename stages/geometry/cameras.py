@@ -1,0 +1,141 @@
+"""Pinhole cameras with OpenCV's distortion, and the rays through their pixels.
+
+Axes are OpenCV's (x right, y down, z forward); pixel (0, 0) is the centre of the top-left pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from stages.errors import StageError
+
+_UNDISTORTED = (0.0, 0.0, 0.0, 0.0, 0.0)
+_NEWTON_STEPS = 25
+_INVERSE_TOLERANCE_PX = 1e-4
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics in pixels; distortion is OpenCV's k1 k2 p1 p2 k3. StageError if they make no camera."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float] = _UNDISTORTED
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if len(self.distortion) != 5 or not np.all(np.isfinite(numbers)):
+            raise StageError(f"a camera needs finite intrinsics and five distortion coefficients, got {self}")
+        if min(self.width, self.height) < 1 or min(self.fx, self.fy) <= 0:
+            raise StageError(f"a camera needs a positive size and positive focal lengths, got {self}")
+
+    def matrix(self) -> np.ndarray:
+        """The (3, 3) intrinsic matrix, distortion left out."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The camera of this image resized to (width, height); a pixel's area is scaled, not its centre."""
+        sx, sy = width / self.width, height / self.height
+        cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        return replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=cx, cy=cy)
+
+    def scaled(self, factor: float) -> Camera:
+        """resized() by a factor, to the nearest whole size."""
+        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+
+    def undistorted(self) -> Camera:
+        """The same camera without distortion."""
+        return replace(self, distortion=_UNDISTORTED)
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether any distortion coefficient differs from zero."""
+        return any(self.distortion)
+
+    def grid(self) -> np.ndarray:
+        """The (x, y) of every pixel, (height * width, 2) float32, row by row."""
+        x, y = np.meshgrid(np.arange(self.width, dtype=np.float32), np.arange(self.height, dtype=np.float32))
+        return np.stack([x.ravel(), y.ravel()], axis=1)
+
+    def directions(self, pixels: np.ndarray) -> np.ndarray:
+        """Directions (n, 3) float32 in the camera frame with z = 1 through pixels (n, 2), distortion removed.
+
+        StageError where the distortion has no inverse (it folds the image over itself at that pixel).
+        """
+        distorted = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+        ideal = self._undistort(distorted) if self.is_distorted else distorted
+        return np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1).astype(np.float32)
+
+    def project(self, points_in_cam: np.ndarray) -> np.ndarray:
+        """Pixels (n, 2) float64, with distortion, of points (n, 3) in the camera frame; NaN where z <= 0."""
+        points = np.asarray(points_in_cam, dtype=np.float64)
+        z = np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
+        ideal = points[:, :2] / z
+        if self.is_distorted:
+            ideal = distort(ideal, self.distortion)[0]
+        return ideal * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def _undistort(self, distorted: np.ndarray) -> np.ndarray:
+        """Invert the distortion of normalised image points (n, 2) by Newton's method."""
+        ideal = distorted.copy()
+        tolerance = _INVERSE_TOLERANCE_PX / max(self.fx, self.fy)
+        for _ in range(_NEWTON_STEPS):
+            predicted, jacobian = distort(ideal, self.distortion)
+            residual = predicted - distorted
+            determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
+            failed = ~((np.abs(residual) < tolerance).all(axis=1) & (determinant > 0))
+            if not failed.any():
+                return ideal
+            ideal -= _solve_2x2(jacobian, determinant, residual)
+        worst = distorted[np.argmax(failed)] * (self.fx, self.fy) + (self.cx, self.cy)
+        raise StageError(
+            f"the distortion {self.distortion} has no inverse at pixel ({worst[0]:.1f}, {worst[1]:.1f});"
+            " recalibrate the camera or crop the image to where the model is valid"
+        )
+
+
+def distort(ideal: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Distorted points (n, 2) of ideal normalised image points (n, 2), and the (n, 2, 2) derivative by them.
+
+    Source: Brown, Decentering distortion of lenses (1966), in OpenCV's order k1 k2 p1 p2 k3.
+    """
+    k1, k2, p1, p2, k3 = distortion
+    x, y = ideal[:, 0], ideal[:, 1]
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+    distorted = np.empty_like(ideal)
+    distorted[:, 0] = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    distorted[:, 1] = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    jacobian = np.empty((len(ideal), 2, 2))
+    jacobian[:, 0, 0] = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
+    jacobian[:, 1, 1] = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
+    jacobian[:, 0, 1] = jacobian[:, 1, 0] = x * y * slope + 2 * p1 * x + 2 * p2 * y
+    return distorted, jacobian
+
+
+def rays(
+    camera: Camera, cam_from_object: np.ndarray, pixels: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions, each (n, 3) float32 in object coordinates, through pixels (n, 2) or all of grid().
+
+    Directions have length 1 along the optical axis: ``origin + depth * direction`` is the point at that depth.
+    """
+    in_cam = camera.directions(camera.grid() if pixels is None else pixels)
+    object_from_cam_rotation = cam_from_object[:3, :3].T
+    directions = (in_cam @ object_from_cam_rotation.T).astype(np.float32)
+    origin = (-object_from_cam_rotation @ cam_from_object[:3, 3]).astype(np.float32)
+    return np.repeat(origin[None], len(directions), axis=0), directions
+
+
+def _solve_2x2(matrix: np.ndarray, determinant: np.ndarray, right: np.ndarray) -> np.ndarray:
+    safe = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)
+    x = (matrix[:, 1, 1] * right[:, 0] - matrix[:, 0, 1] * right[:, 1]) / safe
+    y = (matrix[:, 0, 0] * right[:, 1] - matrix[:, 1, 0] * right[:, 0]) / safe
+    return np.stack([x, y], axis=1)

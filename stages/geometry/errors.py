@@ -1,0 +1,19 @@
+"""How far one pose is from another."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from stages.geometry.rigid import camera_centre
+
+
+def rotation_error_deg(cam_from_object_a: np.ndarray, cam_from_object_b: np.ndarray) -> float:
+    """The angle of the rotation between two poses, 0 to 180 degrees."""
+    between = Rotation.from_matrix(cam_from_object_a[:3, :3] @ cam_from_object_b[:3, :3].T)
+    return float(np.rad2deg(between.magnitude()))
+
+
+def translation_error(cam_from_object_a: np.ndarray, cam_from_object_b: np.ndarray) -> float:
+    """The distance between the two camera centres, in object units."""
+    return float(np.linalg.norm(camera_centre(cam_from_object_a) - camera_centre(cam_from_object_b)))

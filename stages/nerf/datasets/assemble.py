@@ -1,0 +1,89 @@
+"""What the readers of all kinds share: splits, and from images with poses to a Dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from stages.errors import DatasetError
+from stages.nerf.datasets import images
+from stages.nerf.datasets.bounds import SceneBounds, box_bounds, object_bounds, unbounded_bounds
+from stages.nerf.datasets.records import Dataset, ImageRecord, Kind, Scene
+
+Holdout = Literal["auto", "odd", "every8"]
+Split = Literal["train", "test", "all"]
+
+
+@dataclass(frozen=True, eq=False)
+class Draft:
+    """All images of a dataset, both splits, before a split and a size are chosen."""
+
+    kind: Kind
+    records: list[ImageRecord]
+    aabb: object = None
+    object_aabb: object = None
+    metres_per_unit: float | None = None
+    depths: tuple[float, float] | None = None
+    unit: str = "unit of the dataset"
+    scale: float = 1.0
+    notes: tuple[str, ...] = ()
+
+
+def split_of(index: int, holdout: Holdout | None) -> Literal["train", "test"]:
+    """The split of the image at `index` in the sorted order; None holds nothing out."""
+    held_out = index % 2 == 1 if holdout == "odd" else holdout == "every8" and index % 8 == 0
+    return "test" if held_out else "train"
+
+
+def assemble(root: Path, draft: Draft, split: Split) -> Dataset:
+    """The Dataset of one split; what it says of the scene depends on the training images alone.
+
+    DatasetError if the split is empty or some images have an alpha channel and others none.
+    """
+    chosen = tuple(record for record in draft.records if split in ("all", record.split))
+    if not chosen:
+        raise DatasetError(f"{root}: the {split} split is empty; choose another split or holdout, or add images")
+    train = [record for record in draft.records if record.split == "train"] or draft.records
+    transparent = _is_transparent(draft.records)
+    scene: Scene = "object" if transparent else "unbounded" if draft.aabb is None else "bounded"
+    return Dataset(
+        root=root,
+        kind=draft.kind,
+        scene=scene,
+        background="white" if transparent else None,
+        images=chosen,
+        bounds=_bounds(scene, draft, train),
+        unit=draft.unit,
+        scale=draft.scale,
+        metres_per_unit=draft.metres_per_unit,
+        object_aabb=None if draft.object_aabb is None else np.array(draft.object_aabb, dtype=np.float64),
+        notes=draft.notes,
+    )
+
+
+def _bounds(scene: Scene, draft: Draft, train: list[ImageRecord]) -> SceneBounds:
+    poses = [record.cam_from_object for record in train]
+    if draft.aabb is not None:
+        return box_bounds(np.array(draft.aabb, dtype=np.float64), poses)
+    if scene == "object":
+        return object_bounds([record.camera for record in train], poses)
+    return unbounded_bounds(poses, draft.depths)
+
+
+def _is_transparent(records: list[ImageRecord]) -> bool:
+    """Whether the images cut an object out by their alpha channel (one that is opaque everywhere does not)."""
+    with_alpha = [images.probe(record.path).has_alpha for record in records]
+    first = records[0]
+    if not with_alpha[0] or (images.load_pixels(first.path, *_size(first), alpha=True)[..., 3] == 255).all():
+        return False
+    if not all(with_alpha):
+        path = records[with_alpha.index(False)].path
+        raise DatasetError(f"{path}: the image has no alpha channel, {first.path.name} has one; export them alike")
+    return True
+
+
+def _size(record: ImageRecord) -> tuple[int, int]:
+    return record.camera.width, record.camera.height

@@ -1,0 +1,94 @@
+"""Where a scene is, told from its cameras: the space that a field of it should cover."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry.cameras import Camera
+from stages.geometry.rigid import camera_centre
+
+_AROUND_THE_VIEW = 1.05
+_AROUND_THE_CAMERAS = 1.05
+_NEAR_SHARE_OF_RADIUS = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class SceneBounds:
+    """A ball (centre (3,), radius) and a box aabb (2, 3) = (lowest, highest corner), in object coordinates.
+
+    Bounded scenes lie within aabb, and the ball is drawn around it. Of unbounded scenes the ball holds the cameras
+    and what they look at, aabb is the cube around the ball, and the rest lies beyond. near and far: the depths
+    worth sampling; far is None where it is not known.
+    """
+
+    centre: np.ndarray
+    radius: float
+    aabb: np.ndarray
+    near: float
+    far: float | None
+
+
+def object_bounds(cameras: Sequence[Camera], poses: Sequence[np.ndarray]) -> SceneBounds:
+    """Bounds of an object that the cameras surround: a cube a little wider than what they see at its distance."""
+    centre = nearest_point_to_axes(poses)
+    half = max(
+        np.linalg.norm(camera_centre(cam_from_object) - centre)
+        * max(camera.width / camera.fx, camera.height / camera.fy)
+        / 2
+        for camera, cam_from_object in zip(cameras, poses, strict=True)
+    )
+    half *= _AROUND_THE_VIEW
+    return box_bounds(np.stack([centre - half, centre + half]), poses)
+
+
+def box_bounds(aabb: np.ndarray, poses: Sequence[np.ndarray]) -> SceneBounds:
+    """Bounds of a scene that lies within a known box (2, 3); cameras may be inside it."""
+    centre, radius = aabb.mean(axis=0), float(np.linalg.norm(aabb[1] - aabb[0]) / 2)
+    distances = np.linalg.norm(_centres(poses) - centre, axis=1)
+    near = max(float(distances.min()) - radius, _NEAR_SHARE_OF_RADIUS * radius)
+    return SceneBounds(centre, radius, aabb, near, float(distances.max()) + radius)
+
+
+def unbounded_bounds(poses: Sequence[np.ndarray], depths: tuple[float, float] | None = None) -> SceneBounds:
+    """Bounds of a scene without end; depths: its nearest and farthest content, for cameras that face one way."""
+    centres = _centres(poses)
+    if depths is None:
+        centre = nearest_point_to_axes(poses)
+    else:
+        harmonic_mean = 2 / (1 / depths[0] + 1 / depths[1])
+        centre = centres.mean(axis=0) + harmonic_mean * _mean_direction(poses)
+    radius = _AROUND_THE_CAMERAS * float(np.linalg.norm(centres - centre, axis=1).max())
+    near = _NEAR_SHARE_OF_RADIUS * radius if depths is None else 0.9 * depths[0]
+    aabb = np.stack([centre - radius, centre + radius])
+    return SceneBounds(centre, radius, aabb, near, None if depths is None else depths[1])
+
+
+def nearest_point_to_axes(poses: Sequence[np.ndarray]) -> np.ndarray:
+    """The point (3,) with the least sum of squared distances to the optical axes.
+
+    Where the axes do not meet in front of the cameras (one camera, or all parallel), a point in front of the middle
+    camera, as far away as the cameras are spread.
+    """
+    centres, forwards = _centres(poses), np.stack([cam_from_object[2, :3] for cam_from_object in poses])
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
+    total = across.sum(axis=0)
+    middle = centres.mean(axis=0)
+    if np.linalg.eigvalsh(total)[0] > 1e-6 * len(poses):
+        point = np.linalg.solve(total, (across @ centres[:, :, None]).sum(axis=0)[:, 0])
+        if np.median(np.einsum("ij,ij->i", point - centres, forwards)) > 0:
+            return point
+    spread = float(np.linalg.norm(centres - middle, axis=1).max())
+    return middle + (spread if spread > 0 else 1.0) * _mean_direction(poses)
+
+
+def _mean_direction(poses: Sequence[np.ndarray]) -> np.ndarray:
+    total = np.sum([cam_from_object[2, :3] for cam_from_object in poses], axis=0)
+    length = np.linalg.norm(total)
+    return total / length if length > 1e-9 else np.asarray(poses[0][2, :3])
+
+
+def _centres(poses: Sequence[np.ndarray]) -> np.ndarray:
+    return np.stack([camera_centre(cam_from_object) for cam_from_object in poses])

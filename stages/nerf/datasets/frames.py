@@ -1,0 +1,193 @@
+"""The JSON of posed images that instant-ngp, nerfstudio and NeRF-synthetic share, read and checked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from stages.errors import DatasetError
+from stages.geometry.rigid import inverse, is_rigid, nearest_rigid
+from stages.nerf.datasets.images import EXTENSIONS, ImageHeader, probe
+from stages.nerf.datasets.intrinsics import Intrinsics, camera_of
+from stages.nerf.datasets.records import ImageRecord
+
+RIGID_TOLERANCE = 1e-3
+OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+class Frame(Intrinsics, kw_only=True):
+    """One posed image; its own intrinsics, where given, override the file's."""
+
+    file_path: str
+    transform_matrix: list[list[float]]
+    sharpness: float | None = None
+    depth_file_path: str | None = None
+    depth_scale: float | None = None
+    mask_file_path: str | None = None
+    mask_path: str | None = None
+
+
+class Document(Intrinsics, kw_only=True):
+    """A whole file."""
+
+    frames: list[Frame]
+    aabb: Box | None = None
+    object_aabb: Box | None = None
+    metres_per_unit: float | None = None
+    depth_scale: float | None = None
+    train_filenames: list[str] | None = None
+    val_filenames: list[str] | None = None
+    test_filenames: list[str] | None = None
+
+
+def read_document(file: Path) -> Document:
+    """Parse and check a file of frames. DatasetError if it is no such JSON or holds no frame."""
+    try:
+        document = msgspec.convert(json.loads(file.read_text(encoding="utf-8")), Document)
+    except FileNotFoundError as error:
+        raise DatasetError(f"{file}: no such file") from error
+    except (OSError, ValueError, RecursionError) as error:
+        what = "not as expected" if isinstance(error, msgspec.ValidationError) else "not valid JSON"
+        raise DatasetError(f"{file}: {what} ({error}); export the dataset again") from error
+    if not document.frames:
+        raise DatasetError(f"{file}: it has no frames; export the dataset again")
+    _check_document(file, document)
+    return document
+
+
+def find_image(root: Path, file_path: str) -> Path | None:
+    """The image that a frame names, whose extension may be left out; None if there is none."""
+    path = root / file_path.replace("\\", "/")
+    candidates = (path, *(path.with_name(path.name + extension) for extension in EXTENSIONS))
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def read_records(
+    file: Path, document: Document, split: Literal["train", "test"], pixel_centre: float
+) -> list[ImageRecord]:
+    """The images of a document, at full size, in its order; pixel_centre: where its first pixel's centre lies.
+
+    DatasetError if an image is missing or has another size than stated, or a pose is not rigid.
+    """
+    found = [_found(file, frame) for frame in document.frames]
+    headers = [probe(path) for path in found]
+    _check_sizes(file, document, found, headers)
+    records = [
+        _record(file, document, frame, path, header, split, pixel_centre)
+        for frame, path, header in zip(document.frames, found, headers, strict=True)
+    ]
+    check_distinct(file, records)
+    return records
+
+
+def check_distinct(file: Path, records: Sequence[ImageRecord]) -> None:
+    """DatasetError if one image is listed twice."""
+    seen: set[str] = set()
+    for record in records:
+        if record.name in seen:
+            raise DatasetError(f"{file}: {record.name} is listed twice; take one of its frames out")
+        seen.add(record.name)
+
+
+def checked_rigid(object_from_cam: np.ndarray, where: str) -> np.ndarray:
+    """The rigid transform that a stored matrix is, its rounding removed. DatasetError if it is not nearly one."""
+    if not np.all(np.isfinite(object_from_cam)):
+        raise DatasetError(
+            f"{where}: the pose has a number that is not finite; take the image out or pose it again"
+        )
+    if not is_rigid(object_from_cam, RIGID_TOLERANCE):
+        scale = np.linalg.norm(object_from_cam[:3, :3], axis=0)
+        determinant = np.linalg.det(object_from_cam[:3, :3])
+        raise DatasetError(
+            f"{where}: the pose is not rigid (column lengths {np.round(scale, 4).tolist()}, determinant"
+            f" {determinant:.4g}, last row {object_from_cam[3].tolist()}); export rigid poses"
+        )
+    return nearest_rigid(object_from_cam)
+
+
+def relative_name(root: Path, path: Path) -> str:
+    """The path of an image below its dataset, with / between its parts."""
+    return path.relative_to(root).as_posix() if path.is_relative_to(root) else path.as_posix()
+
+
+def _check_document(file: Path, document: Document) -> None:
+    for name in ("aabb", "object_aabb"):
+        box = getattr(document, name)
+        if box is not None and not (np.isfinite(box).all() and np.less(box[0], box[1]).all()):
+            raise DatasetError(f"{file}: {name} must be its lowest and its highest corner, got {box}")
+    for name in ("metres_per_unit", "depth_scale"):
+        number = getattr(document, name)
+        if number is not None and not 0 < number < np.inf:
+            raise DatasetError(f"{file}: {name} must be positive, got {number}")
+
+
+def _found(file: Path, frame: Frame) -> Path:
+    path = find_image(file.parent, frame.file_path)
+    if path is None:
+        raise DatasetError(
+            f"{file.parent / frame.file_path}: no such image, but {file.name} lists it;"
+            " restore the image or take its frame out"
+        )
+    return path
+
+
+def _check_sizes(file: Path, document: Document, paths: list[Path], headers: list[ImageHeader]) -> None:
+    """Images may differ in size only where each frame says its own size or intrinsics."""
+    for frame, path, header in zip(document.frames, paths, headers, strict=True):
+        stated = (frame.w or document.w or header.width, frame.h or document.h or header.height)
+        if stated != (header.width, header.height):
+            raise DatasetError(
+                f"{path}: the image has {header.width}x{header.height} pixels but {file.name} says"
+                f" {stated[0]:g}x{stated[1]:g}; resize the image or give its frame its own w, h and intrinsics"
+            )
+        shared = frame.fl_x is None and frame.camera_angle_x is None
+        if shared and (header.width, header.height) != (headers[0].width, headers[0].height):
+            raise DatasetError(
+                f"{path}: the image has {header.width}x{header.height} pixels, others have {headers[0].width}x"
+                f"{headers[0].height}; resize it or give its frame its own intrinsics in {file.name}"
+            )
+
+
+def _record(
+    file: Path, document: Document, frame: Frame, path: Path, header: ImageHeader,
+    split: Literal["train", "test"], pixel_centre: float,
+) -> ImageRecord:  # fmt: skip
+    where = f"{file}: frame {frame.file_path}"
+    depth_path = _companion(file, frame.depth_file_path)
+    depth_scale = frame.depth_scale or document.depth_scale
+    if depth_path is not None and not (depth_scale is not None and 0 < depth_scale < np.inf):
+        raise DatasetError(f"{where}: a depth file needs depth_scale, the length of one step, as a positive number")
+    return ImageRecord(
+        name=relative_name(file.parent, path),
+        path=path,
+        camera=camera_of(document, frame, header, pixel_centre, where),
+        cam_from_object=OPENCV_FROM_OPENGL @ inverse(checked_rigid(_matrix(frame, where), where)),
+        split=split,
+        depth_path=depth_path,
+        depth_scale=depth_scale or 1.0,
+        mask_path=_companion(file, frame.mask_file_path or frame.mask_path),
+    )
+
+
+def _matrix(frame: Frame, where: str) -> np.ndarray:
+    rows = frame.transform_matrix
+    if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows):
+        raise DatasetError(
+            f"{where}: transform_matrix must be 4x4, got {len(rows)} rows of {[len(r) for r in rows]}"
+        )
+    return np.array(rows if len(rows) == 4 else [*rows, [0, 0, 0, 1]], dtype=np.float64)
+
+
+def _companion(file: Path, file_path: str | None) -> Path | None:
+    if file_path is None:
+        return None
+    path = file.parent / file_path.replace("\\", "/")
+    if not path.is_file():
+        raise DatasetError(f"{path}: no such file, but {file.name} lists it; restore it or take its entry out")
+    return path

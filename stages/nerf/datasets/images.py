@@ -1,0 +1,116 @@
+"""Reading single image files: size without decoding, pixels, depths and masks, always at the size asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from stages.errors import DatasetError
+
+EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+_Result = TypeVar("_Result")
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    """What a file says of its image before any pixel is decoded."""
+
+    width: int
+    height: int
+    has_alpha: bool
+
+
+def probe(path: Path) -> ImageHeader:
+    """Read the header of an image file. DatasetError if it is missing or no image."""
+    return _read(path, lambda image: ImageHeader(image.width, image.height, _has_alpha(image)))
+
+
+def load_pixels(path: Path, width: int, height: int, alpha: bool) -> np.ndarray:
+    """The image as (height, width, 4 if alpha else 3) uint8 RGB(A), resized by area.
+
+    EXIF orientation is ignored, as it is by the programs that solve for the poses. DatasetError if the file is
+    missing, truncated or no image.
+    """
+    pixels = _read(path, lambda image: np.array(image.convert("RGBA" if alpha else "RGB")))
+    return _resize_rgba(pixels, width, height) if alpha else _resize(pixels, width, height)
+
+
+def load_depth(path: Path, width: int, height: int, scale: float) -> np.ndarray:
+    """Depth along the optical axis, (height, width) float32: the stored numbers times scale, 0 where unknown.
+
+    Reads one-channel images (8, 16 or 32 bit) and .npy files; depths of neighbouring pixels are never mixed.
+    """
+    stored = _load_array(path) if path.suffix == ".npy" else _read(path, np.array)
+    if stored.ndim != 2 or not np.issubdtype(stored.dtype, np.number):
+        raise DatasetError(f"{path}: expected one depth a pixel, got shape {stored.shape} of {stored.dtype}")
+    return _resize_nearest(stored.astype(np.float32) * np.float32(scale), width, height)
+
+
+def load_mask(path: Path, width: int, height: int) -> np.ndarray:
+    """A mask image as (height, width) bool: True where it is brighter than the middle grey."""
+    grey = _read(path, lambda image: np.array(image.convert("L")))
+    return _resize_nearest(grey, width, height) > 127
+
+
+def over_background(rgba: np.ndarray, background: str | None) -> np.ndarray:
+    """Lay (h, w, 4) uint8 over "white" or "black" (None: black); (h, w, 3) comes back as it is."""
+    if rgba.shape[-1] == 3:
+        return rgba
+    alpha = rgba[..., 3:].astype(np.float32) / 255
+    colour = rgba[..., :3] * alpha + (255 if background == "white" else 0) * (1 - alpha)
+    return np.rint(colour).astype(np.uint8)
+
+
+def _read(path: Path, use: Callable[[Image.Image], _Result]) -> _Result:
+    try:
+        with Image.open(path) as image:
+            return use(image)
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path}: no such image; restore the file or take it out of the dataset") from error
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        reason = "not an image" if isinstance(error, Image.UnidentifiedImageError) else error
+        raise DatasetError(
+            f"{path}: cannot be read ({reason}); restore the file or take it out of the dataset"
+        ) from error
+
+
+def _load_array(path: Path) -> np.ndarray:
+    try:
+        return np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DatasetError(f"{path}: not a readable .npy file ({error}); export it again") from error
+
+
+def _has_alpha(image: Image.Image) -> bool:
+    return image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+
+
+def _resize(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    shrinks = width <= pixels.shape[1] and height <= pixels.shape[0]
+    return cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+
+
+def _resize_rgba(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Average colours weighted by alpha, so that what lies behind transparent pixels does not bleed into edges."""
+    if pixels.shape[:2] == (height, width):
+        return pixels
+    weighted = pixels.astype(np.float32)
+    weighted[..., :3] *= weighted[..., 3:] / 255
+    resized = _resize(weighted, width, height)
+    alpha = resized[..., 3:]
+    colour = np.divide(resized[..., :3] * 255, alpha, out=np.zeros_like(resized[..., :3]), where=alpha > 0)
+    return np.rint(np.clip(np.concatenate([colour, alpha], axis=2), 0, 255)).astype(np.uint8)
+
+
+def _resize_nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
+    if values.shape == (height, width):
+        return values
+    return cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)

@@ -1,0 +1,98 @@
+"""From the intrinsics of a JSON file, in their many spellings, to a Camera."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+
+from stages.errors import DatasetError, StageError
+from stages.geometry.cameras import Camera
+from stages.nerf.datasets.images import ImageHeader
+
+PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
+
+
+class Intrinsics(msgspec.Struct, kw_only=True):
+    """Of a whole file or of one frame; angles are full fields of view in radians."""
+
+    w: float | None = None
+    h: float | None = None
+    fl_x: float | None = None
+    fl_y: float | None = None
+    cx: float | None = None
+    cy: float | None = None
+    k1: float | None = None
+    k2: float | None = None
+    k3: float | None = None
+    k4: float | None = None
+    p1: float | None = None
+    p2: float | None = None
+    camera_angle_x: float | None = None
+    camera_angle_y: float | None = None
+    camera_model: str | None = None
+    is_fisheye: bool | None = None
+
+
+def camera_of(
+    document: Intrinsics, frame: Intrinsics, header: ImageHeader, pixel_centre: float, where: str
+) -> Camera:
+    """The camera of one frame: its own numbers first, the file's next, a centred principal point last.
+
+    pixel_centre: the coordinate that the file gives to the centre of the first pixel (COLMAP's is 0.5).
+    DatasetError if there is no focal length, or the model is not a pinhole with OpenCV's distortion.
+    """
+    _check_model(document, frame, where)
+    if _stated(document, frame, "k4"):
+        raise DatasetError(f"{where}: k4 belongs to a fisheye lens; undistort the images to a pinhole camera first")
+    fx, fy = _focal_lengths(document, frame, header, where)
+    cx, cy = _stated(document, frame, "cx"), _stated(document, frame, "cy")
+    cx = header.width / 2 - 0.5 if cx is None else cx - pixel_centre
+    cy = header.height / 2 - 0.5 if cy is None else cy - pixel_centre
+    k1, k2, p1, p2, k3 = (_stated(document, frame, name) or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
+    try:
+        camera = Camera(header.width, header.height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+        _check_invertible(camera)
+    except StageError as error:
+        raise DatasetError(f"{where}: {error}") from error
+    return camera
+
+
+def _stated(document: Intrinsics, frame: Intrinsics, name: str) -> float | None:
+    own = getattr(frame, name)
+    return own if own is not None else getattr(document, name)
+
+
+def _check_model(document: Intrinsics, frame: Intrinsics, where: str) -> None:
+    model = frame.camera_model or document.camera_model or "OPENCV"
+    fisheye = frame.is_fisheye if frame.is_fisheye is not None else document.is_fisheye
+    if fisheye or model.upper() not in PINHOLE_MODELS:
+        what = "is_fisheye" if fisheye else f"camera_model {model}"
+        raise DatasetError(
+            f"{where}: {what} is not supported; undistort the images to a pinhole camera (OPENCV or PINHOLE) first"
+        )
+
+
+def _focal_lengths(document: Intrinsics, frame: Intrinsics, header: ImageHeader, where: str) -> tuple[float, float]:
+    for source in (frame, document):
+        fx = _focal_length(source.fl_x, source.camera_angle_x, header.width, where)
+        if fx is not None:
+            return fx, _focal_length(source.fl_y, source.camera_angle_y, header.height, where) or fx
+    raise DatasetError(f"{where}: no focal length; the file needs fl_x or camera_angle_x")
+
+
+def _focal_length(focal: float | None, angle: float | None, pixels: int, where: str) -> float | None:
+    if focal is not None:
+        return focal
+    if angle is None:
+        return None
+    if not 0 < angle < math.pi:
+        raise DatasetError(f"{where}: camera_angle must lie between 0 and pi radians, got {angle}")
+    return 0.5 * pixels / math.tan(0.5 * angle)
+
+
+def _check_invertible(camera: Camera) -> None:
+    if camera.is_distorted:
+        right, bottom = camera.width - 0.5, camera.height - 0.5
+        camera.directions(np.array([(-0.5, -0.5), (right, -0.5), (-0.5, bottom), (right, bottom)]))

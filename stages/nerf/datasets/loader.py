@@ -1,0 +1,62 @@
+"""Open a dataset of whatever kind its folder shows it to be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stages.errors import DatasetError
+from stages.nerf.datasets import blender, llff, transforms
+from stages.nerf.datasets.assemble import Draft, Holdout, Split, assemble
+from stages.nerf.datasets.records import Dataset
+
+
+def load_dataset(
+    path: str | Path,
+    split: Split = "train",
+    size: int | None = None,
+    downscale: int | None = None,
+    *,
+    holdout: Holdout | None = "auto",
+    llff_normalise: bool = True,
+) -> Dataset:
+    """Read a dataset's poses and cameras, and make sure that its files are there; pixels are read later.
+
+    split: "all" keeps both, each image says which it is in. size: the longer side in pixels to shrink images to.
+    downscale: shrink by this factor instead; LLFF takes the folder of that factor. holdout, for kinds without
+    splits of their own: "odd" or "every8" images (sorted by name) are test, None holds nothing out, "auto" is "odd"
+    for transforms.json and "every8" for LLFF. llff_normalise: see llff.read_llff.
+    Raises DatasetError, one line that names the file and says how to mend it.
+    """
+    root = Path(path)
+    _check_options(root, size, downscale)
+    dataset = assemble(root, _read(root, holdout, llff_normalise, downscale, size), split)
+    if size is not None:
+        return dataset.resized(size)
+    if downscale is not None and dataset.kind != "llff":
+        longest = max(max(record.camera.width, record.camera.height) for record in dataset.images)
+        return dataset.resized(max(1, round(longest / downscale)))
+    return dataset
+
+
+def _read(root: Path, holdout: Holdout | None, normalise: bool, downscale: int | None, size: int | None) -> Draft:
+    if not root.is_dir():
+        what = (
+            "a file; give the folder that it is in" if root.exists() else "no such folder; give a dataset's folder"
+        )
+        raise DatasetError(f"{root}: {what}")
+    if (root / blender.TRAIN_FILE).is_file():
+        return blender.read_blender(root)
+    if (root / transforms.FILE).is_file():
+        return transforms.read_transforms(root, holdout)
+    if (root / llff.FILE).is_file():
+        return llff.read_llff(root, holdout, normalise, downscale, size)
+    names = f"{blender.TRAIN_FILE}, {transforms.FILE} or {llff.FILE}"
+    raise DatasetError(f"{root}: not a dataset; expected {names} in it")
+
+
+def _check_options(root: Path, size: int | None, downscale: int | None) -> None:
+    if size is not None and downscale is not None:
+        raise DatasetError(f"{root}: give size or downscale, not both (got {size} and {downscale})")
+    for name, value in (("size", size), ("downscale", downscale)):
+        if value is not None and value < 1:
+            raise DatasetError(f"{root}: {name} must be at least 1, got {value}")

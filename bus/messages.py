@@ -7,6 +7,7 @@ Each type checks its own shapes when it is made, on the sending and on the recei
 
 from __future__ import annotations
 
+import math
 from enum import StrEnum
 from typing import Any, ClassVar, Literal
 
@@ -74,6 +75,13 @@ class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     capture_ns: int
     sent_ns: int
 
+    def __post_init__(self) -> None:
+        numbers = (self.sequence, self.frame_id, self.pass_index, self.capture_ns, self.sent_ns)
+        if not all(0 <= number < 2**63 for number in numbers):
+            raise ValueError("header: numbers must be from 0 to 2^63 - 1")
+        if len(self.source) > 128:
+            raise ValueError("header: source is longer than 128 characters")
+
 
 class Message(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     """Base of all messages; `_arrays` maps a field to its (dtype, shape), None where any length will do."""
@@ -85,6 +93,16 @@ class Message(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         for name, (dtype, shape) in self._arrays.items():
             check_array(name, getattr(self, name), dtype, shape)
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ValueError(f"{name}: not finite")
+
+
+def check_equal(what: str, sizes: dict[str, Any]) -> None:
+    """Raise ValueError unless the sizes, by the name of their field, are all the same."""
+    if len(set(sizes.values())) > 1:
+        raise ValueError(f"{what} differs: " + ", ".join(f"{name} {size}" for name, size in sizes.items()))
 
 
 def check_array(name: str, value: Any, dtype: str, shape: tuple[int | None, ...]) -> None:
@@ -111,6 +129,7 @@ class Frame(Message, kw_only=True):
     camera: CameraModel
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         shape = (self.camera.height, self.camera.width, 3) if self.encoding == "rgb8" else (None,)
         check_array("image", self.image, "uint8", shape)
 
@@ -152,6 +171,13 @@ class View(Message, kw_only=True):
         "opacity": ("uint8", (None, None)),
     }
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        sizes = {name: getattr(self, name).shape[:2] for name in ("rgb", "depth", "opacity")}
+        if self.ok:
+            sizes["camera"] = (self.camera.height, self.camera.width)
+        check_equal("size", sizes)
+
 
 class Matches(Message, kw_only=True):
     """Pixels of the view and of the frame that show the same surface point; confidence in 0..1."""
@@ -168,9 +194,13 @@ class Matches(Message, kw_only=True):
         "confidence": ("float32", (None,)),
     }
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_equal("length", {name: len(getattr(self, name)) for name in self._arrays})
+
 
 class Correspondences(Message, kw_only=True):
-    """Matches lifted to the object: `consistency` is the paper's m in squared field units; `kept` those below gamma."""
+    """Matches lifted to the object: `consistency` is the paper's m in squared field units; `kept`: below gamma."""
 
     ok: bool
     reason: Reason
@@ -189,6 +219,11 @@ class Correspondences(Message, kw_only=True):
         "consistency": ("float32", (None,)),
         "kept": ("bool", (None,)),
     }
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rows = [name for name in self._arrays if name != "guess_cam_from_object"]
+        check_equal("length", {name: len(getattr(self, name)) for name in rows})
 
 
 class Estimate(Message, kw_only=True):
@@ -241,7 +276,10 @@ class State(Message, kw_only=True):
 
 
 class Stats(Message, kw_only=True):
-    """Counters of one process since it started; sent from its main loop, so that it is the heartbeat as well."""
+    """Counters of one process since it started; sent from its main loop, so that it is the heartbeat as well.
+
+    `gaps` are messages that should have come and did not; `skipped` those that a newest-only input let go.
+    """
 
     stage: str
     ready: bool
@@ -249,6 +287,7 @@ class Stats(Message, kw_only=True):
     published: int
     refused: int
     gaps: int
+    skipped: int
     failed: int
     busy_ms_p50: float
     busy_ms_p90: float

@@ -1,0 +1,271 @@
+"""The life of a process: subscribe -> handle -> publish, with counters, heartbeat, liveliness token and signals.
+
+A stage implements Handler, or JoinedHandler where it needs several inputs of a frame; `run_node` does the rest.
+"""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from types import FrameType
+from typing import Protocol
+
+import numpy as np
+import psutil
+
+from bus.errors import CodecError
+from bus.joining import Joined, Joiner, kept
+from bus.logs import Throttle, stage_logger
+from bus.messages import Header, Message, Reason, Stats
+from bus.ports import Inbox, InboxCounts, Outbox, first_header, reply_header
+from bus.topics import FRAME, STATS, Address, Topic
+from bus.transport import Bus
+
+__all__ = ["EndOfInput", "Handler", "JoinedHandler", "Output", "first_header", "reply_header", "run_node"]
+
+Output = tuple[Topic, Message]
+
+TICK_S = 0.02
+STATS_PERIOD_S = 0.5
+_BUSY_WINDOW = 256
+
+
+class EndOfInput(Exception):  # noqa: N818 - as StopIteration, it is no failure
+    """Raised by a handler that has nothing more to send: its process ends cleanly."""
+
+
+class Handler(Protocol):
+    """What a stage does; all methods are called from one thread."""
+
+    name: str
+    inputs: tuple[Topic, ...]
+    outputs: tuple[Topic, ...]
+
+    def start(self) -> None:
+        """Load, compile, warm up; the process is not ready before this returns."""
+
+    def handle(self, topic: Topic, message: Message) -> Iterable[Output]:
+        """Answer a message; an exception is counted as failed and the process goes on."""
+
+    def tick(self, now_ns: int) -> Iterable[Output]:
+        """Called at least every 20 ms while no message is being handled, for deadlines and sources."""
+
+    def stop(self) -> None:
+        """Let go of what `start` took; called also when `start` was interrupted."""
+
+
+class JoinedHandler:
+    """A handler that gets its inputs joined by frame and pass, and never answers with silence.
+
+    `inputs[0]` drives: each of its messages is answered once. A subclass sets `name`, `inputs` and `outputs`, and
+    implements `process` and `failure`; both may be generators. One that defines `__init__` calls this one's.
+    """
+
+    name: str
+    inputs: tuple[Topic, ...]
+    outputs: tuple[Topic, ...]
+    join_timeout_s: float = 1.0
+
+    def __init__(self) -> None:
+        self.failed = 0
+        self._joiner = Joiner(self.inputs, self.join_timeout_s)
+        self._throttle = Throttle(stage_logger(self.name))
+
+    def start(self) -> None:
+        """Nothing to load unless a subclass says so."""
+
+    def stop(self) -> None:
+        """Nothing to let go unless a subclass says so."""
+
+    def process(self, joined: dict[Topic, Message]) -> Iterable[Output]:
+        """Answer the joined inputs; the driving one has not `ok=false`. An exception becomes INTERNAL_ERROR."""
+        raise NotImplementedError
+
+    def failure(self, header: Header, reason: Reason) -> Iterable[Output]:
+        """The ok=false answer to the driving message with that header."""
+        raise NotImplementedError
+
+    def incomplete(self, joined: dict[Topic, Message], reason: Reason) -> Iterable[Output]:
+        """The answer where an input did not come in time; a failure unless a subclass can do with less."""
+        return self.failure(joined[self.inputs[0]].header, reason)
+
+    def handle(self, topic: Topic, message: Message) -> Iterator[Output]:
+        if topic is self.inputs[0] and not getattr(message, "ok", True):
+            # Upstream's failure is passed on with its reason; nothing else is needed for that.
+            yield from self.failure(message.header, getattr(message, "reason", Reason.INTERNAL_ERROR))
+            return
+        for joined in self._joiner.add(topic, message, time.time_ns()):
+            yield from self._answer(joined)
+
+    def tick(self, now_ns: int) -> Iterator[Output]:
+        for joined in self._joiner.expire(now_ns):
+            yield from self._answer(joined)
+
+    def _answer(self, joined: Joined) -> Iterator[Output]:
+        if joined.missing:
+            reason = Reason.FRAME_MISSING if FRAME in joined.missing else Reason.INTERNAL_ERROR
+            names = ", ".join(topic.name for topic in joined.missing)
+            self._throttle.warning("input missing", inputs=names)
+            yield from self.incomplete(joined.inputs, reason)
+            return
+        try:
+            # All of it before the first is sent, so that a failure half way is one answer and not two.
+            yield from list(self.process(joined.inputs))
+        except Exception as error:
+            self.failed += 1
+            self._throttle.warning("failed", error=describe(error))
+            yield from self.failure(joined.inputs[self.inputs[0]].header, Reason.INTERNAL_ERROR)
+
+
+def describe(error: BaseException) -> str:
+    """An exception in one line, with the place that raised it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f" ({frames[-1].filename.rsplit('/', 1)[-1]}:{frames[-1].lineno})" if frames else ""
+    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}{place}"
+
+
+def run_node(
+    handler: Handler,
+    bus: Bus,
+    address: Address,
+    stop: threading.Event | None = None,
+    stats_period_s: float = STATS_PERIOD_S,
+) -> None:
+    """Run `handler` until SIGTERM, SIGINT, `stop`, or EndOfInput; the bus stays open.
+
+    An exception of `handler.start` is raised; one of `handle` or `tick` is counted, logged and survived.
+    """
+    with _Signals(stop or threading.Event()) as signals:
+        _Node(handler, bus, address, signals.stop, stats_period_s).run(signals)
+
+
+class _Interrupted(BaseException):
+    """A signal to stop, while `start` is at work and nobody looks at the event."""
+
+
+class _Signals:
+    """SIGTERM and SIGINT set `stop`; while `interrupting`, they also break into what the main thread is doing."""
+
+    def __init__(self, stop: threading.Event) -> None:
+        self.stop = stop
+        self.interrupting = False
+        self._before: dict[int, object] = {}
+
+    def __enter__(self) -> _Signals:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGINT):
+                self._before[number] = signal.signal(number, self._caught)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, before in self._before.items():
+            signal.signal(number, before)  # type: ignore[arg-type]
+
+    def _caught(self, number: int, frame: FrameType | None) -> None:
+        self.stop.set()
+        if self.interrupting:
+            raise _Interrupted
+
+
+class _Node:
+    def __init__(
+        self, handler: Handler, bus: Bus, address: Address, stop: threading.Event, stats_period_s: float
+    ) -> None:
+        self._handler = handler
+        self._bus = bus
+        self._address = address
+        self._stop = stop
+        self._stats_period_s = stats_period_s
+        self._outbox = Outbox(bus, address, handler.name)
+        self._inbox: Inbox | None = None
+        self._throttle = Throttle(stage_logger(handler.name))
+        self._failed = 0
+        self._busy_ms: deque[float] = deque(maxlen=_BUSY_WINDOW)
+        self._process = psutil.Process()
+        self._next_tick = self._next_stats = 0.0
+
+    def run(self, signals: _Signals) -> None:
+        self._send_stats(ready=False)
+        try:
+            signals.interrupting = True
+            if not self._stop.is_set():
+                self._handler.start()
+            signals.interrupting = False
+            if not self._stop.is_set():
+                self._serve()
+        except (_Interrupted, EndOfInput):
+            pass
+        finally:
+            signals.interrupting = False
+            self._handler.stop()
+            self._send_stats(ready=False)
+
+    def _serve(self) -> None:
+        joins = isinstance(self._handler, JoinedHandler)
+        capacities = {topic: kept(topic) for topic in self._handler.inputs} if joins else None
+        self._inbox = Inbox(self._bus, self._address, self._handler.inputs, capacities, self._refused)
+        token = self._bus.hold(self._address.live(self._handler.name))
+        try:
+            while not self._stop.is_set():
+                self._step(self._inbox)
+        finally:
+            token.close()
+            self._inbox.close()
+
+    def _step(self, inbox: Inbox) -> None:
+        received = inbox.get(max(0.0, min(self._next_tick, self._next_stats) - time.monotonic()))
+        if received is not None:
+            self._run(lambda: self._handler.handle(received.topic, received.message))
+        if time.monotonic() >= self._next_tick:
+            self._run(lambda: self._handler.tick(time.time_ns()))
+            self._next_tick = time.monotonic() + TICK_S
+        if time.monotonic() >= self._next_stats:
+            self._send_stats(ready=True)
+
+    def _run(self, work: Callable[[], Iterable[Output]]) -> None:
+        """Publish what `work` answers; a call that answers nothing was no work and is not timed."""
+        started = time.perf_counter()
+        before = self._outbox.published
+        try:
+            for topic, message in work():
+                if topic not in self._handler.outputs:
+                    raise ValueError(f"{topic.name} is not among the outputs of {self._handler.name}")
+                self._outbox.publish(topic, message)
+        except EndOfInput:
+            raise
+        except Exception as error:
+            self._failed += 1
+            self._throttle.warning("failed", error=describe(error))
+        if self._outbox.published > before:
+            self._busy_ms.append((time.perf_counter() - started) * 1e3)
+
+    def _refused(self, topic: Topic, error: CodecError) -> None:
+        self._throttle.warning("refused", topic=topic.name, error=str(error))
+
+    def _send_stats(self, ready: bool) -> None:
+        self._next_stats = time.monotonic() + self._stats_period_s
+        self._outbox.publish(STATS, self._stats(ready))
+
+    def _stats(self, ready: bool) -> Stats:
+        counts = self._inbox.counts if self._inbox is not None else InboxCounts()
+        times = self._process.cpu_times()
+        p50, p90 = np.percentile(self._busy_ms, (50, 90)) if self._busy_ms else (0.0, 0.0)
+        return Stats(
+            header=first_header(0, time.time_ns()),
+            stage=self._handler.name,
+            ready=ready,
+            received=counts.received,
+            published=self._outbox.published,
+            refused=counts.refused,
+            gaps=counts.gaps,
+            skipped=counts.skipped,
+            failed=self._failed + (self._handler.failed if isinstance(self._handler, JoinedHandler) else 0),
+            busy_ms_p50=float(p50),
+            busy_ms_p90=float(p90),
+            cpu_s=times.user + times.system,
+            rss_mb=self._process.memory_info().rss / 2**20,
+        )

@@ -1,0 +1,183 @@
+"""Typed ends of a bus: an Outbox fills in headers and encodes, an Inbox queues, decodes and counts gaps."""
+
+from __future__ import annotations
+
+import copy
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import msgspec
+
+from bus.codec import decode, encode
+from bus.errors import CodecError
+from bus.messages import Header, Message
+from bus.topics import Address, Topic
+from bus.transport import Bus, Closing
+
+
+def first_header(frame_id: int, capture_ns: int, pass_index: int = 0) -> Header:
+    """The header of a message that answers no other; sender and sequence are filled in when it is sent."""
+    return Header("", 0, frame_id, pass_index, capture_ns, 0)
+
+
+def reply_header(header: Header) -> Header:
+    """The header of an answer: same frame, pass and capture time; the rest is filled in when it is sent."""
+    return first_header(header.frame_id, header.capture_ns, header.pass_index)
+
+
+class Outbox:
+    """Sends messages of one source; numbers them from 0 per topic."""
+
+    def __init__(self, bus: Bus, address: Address, source: str) -> None:
+        self.published = 0
+        self._bus = bus
+        self._address = address
+        self._source = source
+        self._sequence: dict[str, int] = {}
+
+    def publish(self, topic: Topic, message: Message) -> None:
+        """Send `message` with source, sequence and sending time filled in. Raises CodecError, TransportError."""
+        sequence = self._sequence.get(topic.name, 0)
+        sent = copy.copy(message)
+        sent.header = msgspec.structs.replace(
+            message.header, source=self._source, sequence=sequence, sent_ns=time.time_ns()
+        )
+        self._bus.put(self._address.key(topic, self._source), encode(sent), topic)
+        self._sequence[topic.name] = sequence + 1
+        self.published += 1
+
+
+class Sequences:
+    """What is missing per sender, from the numbers in the headers; joining late is no gap, neither is a restart."""
+
+    def __init__(self) -> None:
+        self.missing: dict[tuple[str, str], int] = {}
+        self._next: dict[tuple[str, str], int] = {}
+
+    def seen(self, key: str, header: Header) -> int:
+        """Note a message received on `key`; return how many of its sender's are missing just before it."""
+        sender = (key, header.source)
+        expected = self._next.get(sender, header.sequence)
+        # A smaller number than expected is a sender that started again, from 0.
+        gap = header.sequence - expected if header.sequence >= expected else header.sequence
+        self._next[sender] = header.sequence + 1
+        self.missing[sender] = self.missing.get(sender, 0) + gap
+        return gap
+
+
+class Received(NamedTuple):
+    topic: Topic
+    message: Message
+    key: str
+    received_ns: int
+
+
+@dataclass
+class InboxCounts:
+    """`gaps` are messages that should have come; `skipped` those that a newest-only queue let go on purpose."""
+
+    received: int = 0
+    refused: int = 0
+    gaps: int = 0
+    skipped: int = 0
+
+
+@dataclass
+class _Queue:
+    topic: Topic
+    capacity: int
+    items: deque[tuple[int, str, bytes, int]] = field(default_factory=deque)
+
+
+class Inbox:
+    """Bounded queues of several topics, read by one thread in the order of arrival.
+
+    `capacities` replaces the table's bound for some topics; `refused(topic, error)` is told of each payload that is
+    no message.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        address: Address,
+        topics: Iterable[Topic],
+        capacities: Mapping[Topic, int] | None = None,
+        refused: Callable[[Topic, CodecError], None] | None = None,
+    ) -> None:
+        self.counts = InboxCounts()
+        self._sequences = Sequences()
+        self._refused = refused
+        self._arrival = 0
+        self._arrived = threading.Condition()
+        self._queues = [_Queue(topic, (capacities or {}).get(topic, topic.capacity)) for topic in topics]
+        self._newest_only = {queue.topic for queue in self._queues if queue.capacity == 1}
+        self._subscriptions: list[Closing] = [
+            bus.subscribe(address.key(queue.topic), self._sink(queue), queue.capacity) for queue in self._queues
+        ]
+
+    def get(self, timeout_s: float) -> Received | None:
+        """The oldest message, waiting up to `timeout_s` for one; None after that, or when `wake` was called."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            item = self._take(max(0.0, deadline - time.monotonic()))
+            if item is None:
+                return None
+            received = self._decode(*item)
+            if received is not None:
+                return received
+
+    def drain(self) -> list[Received]:
+        """Every message that is here now."""
+        return list(iter(lambda: self.get(0.0), None))
+
+    def wake(self) -> None:
+        """Let a waiting `get` return at once."""
+        with self._arrived:
+            self._arrived.notify_all()
+
+    def close(self) -> None:
+        for subscription in self._subscriptions:
+            subscription.close()
+
+    def _sink(self, queue: _Queue) -> Callable[[str, bytes, int], None]:
+        def sink(key: str, payload: bytes, received_ns: int) -> None:
+            with self._arrived:
+                arrival = self._arrival = self._arrival + 1
+                if len(queue.items) >= queue.capacity:
+                    dropped = queue.items.popleft()
+                    # The newest keeps its predecessor's place, else a fast camera would starve behind other topics.
+                    arrival = dropped[0] if queue.capacity == 1 else arrival
+                queue.items.append((arrival, key, payload, received_ns))
+                self._arrived.notify()
+
+        return sink
+
+    def _take(self, timeout_s: float) -> tuple[Topic, str, bytes, int] | None:
+        with self._arrived:
+            if not any(queue.items for queue in self._queues) and timeout_s > 0:
+                self._arrived.wait(timeout_s)
+            waiting = [queue for queue in self._queues if queue.items]
+            if not waiting:
+                return None
+            queue = min(waiting, key=lambda queue: queue.items[0][0])
+            return queue.topic, *queue.items.popleft()[1:]
+
+    def _decode(self, topic: Topic, key: str, payload: bytes, received_ns: int) -> Received | None:
+        try:
+            message = decode(payload, topic.message_type, topic.max_bytes)
+        except CodecError as error:
+            self.counts.refused += 1
+            if self._refused is not None:
+                self._refused(topic, error)
+            return None
+        self.counts.received += 1
+        gap = self._sequences.seen(key, message.header)
+        if topic in self._newest_only:
+            self.counts.skipped += gap
+        else:
+            self.counts.gaps += gap
+        return Received(topic, message, key, received_ns)

@@ -1,0 +1,100 @@
+"""The one table of topics: what goes under which key, how it is queued, how urgent it is, whether recorded."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+from bus import messages
+from bus.errors import TransportError
+
+_PART = re.compile(r"[A-Za-z0-9_.\-]+|\*")
+_KEY_PART = r"[^/*$#?]+"
+
+
+@dataclass(frozen=True)
+class Address:
+    """One pipeline: an (object, camera) pair at a site. Any part may be "*" to listen to several."""
+
+    site: str = "fieldpose"
+    object: str = "object"
+    camera: str = "camera0"
+
+    def __post_init__(self) -> None:
+        for name in ("site", "object", "camera"):
+            _check_part(name, getattr(self, name))
+
+    def key(self, topic: Topic, stage: str = "*") -> str:
+        """The key of `topic` here; only the key of STATS names the stage that sends it."""
+        _check_part("stage", stage)
+        return topic.template.format(site=self.site, object=self.object, camera=self.camera, stage=stage)
+
+    def live(self, stage: str) -> str:
+        """The key of the liveliness token that `stage` holds while it is ready."""
+        _check_part("stage", stage)
+        return f"{self.site}/live/{self.object}/{self.camera}/{stage}"
+
+
+def _check_part(name: str, part: str) -> None:
+    if not _PART.fullmatch(part):
+        raise TransportError(f"{name} {part!r}: a part of a key has letters, digits, '_', '.' and '-', or is '*'")
+
+
+@dataclass(frozen=True, eq=False)
+class Topic:
+    """A row of the table; each topic is one object, compared by identity.
+
+    `capacity` bounds a receiver's queue, in messages: the oldest is dropped for a newer one, so 1 is newest-only.
+    A stage that joins several inputs keeps `JOIN_CAPACITY` of a newest-only topic instead.
+    """
+
+    name: str
+    template: str
+    message_type: type[messages.Message]
+    capacity: int = 64
+    max_bytes: int = 4 << 20
+    priority: Literal["data", "data_low"] = "data"
+    congestion: Literal["block_first", "drop"] = "block_first"
+    recorded: bool = True
+
+    @property
+    def newest_only(self) -> bool:
+        return self.capacity == 1
+
+    def matches(self, key: str) -> bool:
+        """Whether `key`, without wildcards, is a key of this topic."""
+        names = ("site", "object", "camera", "stage")
+        return re.fullmatch(self.template.format(**dict.fromkeys(names, _KEY_PART)), key) is not None
+
+
+JOIN_CAPACITY = 64
+
+_PIPELINE = "{site}/track/{object}/{camera}/"
+_IMAGE_BYTES = 80 << 20
+
+FRAME = Topic(
+    "frame", "{site}/camera/{camera}/frame", messages.Frame, capacity=1, max_bytes=_IMAGE_BYTES, priority="data_low"
+)
+TRUTH = Topic("truth", _PIPELINE + "truth", messages.Truth, max_bytes=64 << 10)
+GUESS = Topic("guess", _PIPELINE + "guess", messages.Guess, max_bytes=64 << 10)
+VIEW = Topic("view", _PIPELINE + "view", messages.View, capacity=16, max_bytes=_IMAGE_BYTES, priority="data_low")
+MATCHES = Topic("matches", _PIPELINE + "matches", messages.Matches)
+CORRESPONDENCES = Topic("correspondences", _PIPELINE + "correspondences", messages.Correspondences)
+ESTIMATE = Topic("estimate", _PIPELINE + "estimate", messages.Estimate)
+POSE = Topic("pose", _PIPELINE + "pose", messages.Pose, max_bytes=64 << 10)
+STATE = Topic("state", _PIPELINE + "state", messages.State, max_bytes=64 << 10)
+STATS = Topic(
+    "stats", "{site}/stats/{object}/{camera}/{stage}", messages.Stats, capacity=256, max_bytes=16 << 10,
+    congestion="drop",
+)  # fmt: skip
+
+ALL: tuple[Topic, ...] = (
+    FRAME, TRUTH, GUESS, VIEW, MATCHES, CORRESPONDENCES, ESTIMATE, POSE, STATE, STATS,
+)  # fmt: skip
+BY_NAME: dict[str, Topic] = {topic.name: topic for topic in ALL}
+
+
+def topic_of(key: str) -> Topic | None:
+    """The topic that a concrete key belongs to, None where it is none of ours."""
+    return next((topic for topic in ALL if topic.matches(key)), None)

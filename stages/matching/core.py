@@ -29,6 +29,8 @@ MATCHERS = {
 }
 """Name in the configuration -> module and the callable in it that makes a Matcher of a MatchingConfig."""
 
+_KEPT_VIEWS, _KEPT_FRAMES = 16, 2
+
 
 @dataclass(frozen=True)
 class MatchingConfig:
@@ -58,7 +60,7 @@ class MatchingConfig:
 
 @dataclass(frozen=True)
 class Features:
-    """One image to a matcher: its keypoints' pixels (n, 2) float32, its size (width, height), the matcher's own data."""
+    """An image to a matcher: its keypoints (n, 2) float32, its size (width, height), the matcher's own data."""
 
     pixels: np.ndarray
     size: tuple[int, int]
@@ -119,12 +121,9 @@ def shrink(image: np.ndarray, longer_side: int) -> tuple[np.ndarray, np.ndarray]
 class PairMatcher:
     """Matches views with frames and keeps the features of the last ones, for views and frames that come again."""
 
-    def __init__(
-        self, matcher: Matcher, config: MatchingConfig, kept_views: int = 16, kept_frames: int = 2
-    ) -> None:
+    def __init__(self, matcher: Matcher, config: MatchingConfig) -> None:
         self._matcher, self._config = matcher, config
-        self._views = _LastUsed(kept_views)
-        self._frames = _LastUsed(kept_frames)
+        self._views, self._frames = _LastUsed(_KEPT_VIEWS), _LastUsed(_KEPT_FRAMES)
 
     def match(
         self,

@@ -48,7 +48,7 @@ class SiftMatcher:
 
 
 def _distance_ratio(descriptors: torch.Tensor, others: torch.Tensor) -> np.ndarray:
-    """Distance to the nearest of the others over that to the second nearest, (n,) float32; 0 if there is but one."""
+    """Distance to the nearest of the others over that to the second, (n,) float32; 0 if there is but one."""
     if len(others) < 2 or len(descriptors) == 0:
         return np.zeros(len(descriptors), np.float32)
     distances = torch.sqrt((2 - 2 * torch.topk(descriptors @ others.T, 2).values).clamp_min(1e-12))

@@ -18,7 +18,7 @@ _DERIVED = {"confidence_thresholds", "hw_grid", "num_batches_tracked"}
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """One network's weights: the file's name, the package that carries it (or None), and kornia's addresses of it."""
+    """A network's weights: the file's name, the package that carries it (or None), kornia's addresses of it."""
 
     name: str
     package: str | None
@@ -81,7 +81,7 @@ def _download(file: WeightsFile) -> Path:
 
 
 def read_state(path: Path) -> dict[str, torch.Tensor]:
-    """The tensors by name in a .safetensors file or a torch checkpoint (in its `state_dict` or `extractor`, if any).
+    """The tensors by name in a .safetensors file or a torch checkpoint (or in its `state_dict` or `extractor`).
 
     Raises WeightsError if the file is neither, or holds anything but tensors; no code in the file is run.
     """

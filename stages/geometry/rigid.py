@@ -108,7 +108,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> np.ndarray:
     """
     centre = np.asarray(eye, dtype=np.float64)
     forward = _unit(np.asarray(target, dtype=np.float64) - centre, "the viewing direction of look_at")
-    right = _unit(np.cross(forward, _unit(up, "up of look_at")), "the part of up across the view of look_at")
+    right = _unit(np.cross(forward, _unit(up, "up of look_at")), "up of look_at, across the viewing direction,")
     object_from_cam = from_rotation(np.stack([right, np.cross(forward, right), forward], axis=1), centre)
     return inverse(object_from_cam)
 

@@ -1,0 +1,117 @@
+"""Settings of tracking. Lengths marked "x scale" are shares of the spread of the training cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Literal
+
+from stages.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """The constant-velocity model on SE(3)."""
+
+    window_ms: float = 150.0
+    """The velocity is taken between the newest pose and the oldest one at most this much older."""
+    horizon_ms: float = 1000.0
+    """Poses further apart than this say nothing about the velocity, nor does a velocity reach further."""
+    damping_ms: float = 500.0
+    """The velocity is taken to decay with this time constant; inf keeps it."""
+    max_rotation_deg: float = 45.0
+    """Largest turn that is predicted."""
+    max_translation: float = 0.5
+    """Largest shift that is predicted, x scale."""
+
+
+@dataclass(frozen=True)
+class ScoreConfig:
+    """A pose scores the weakest of these measures, each 1 at its good value or better."""
+
+    min_inliers: int = 8
+    """Fewer score 0."""
+    good_inliers: int = 40
+    good_inlier_ratio: float = 0.4
+    good_residual_px: float = 2.0
+    """Median reprojection error of the inliers."""
+    good_sigma_deg: float = 1.0
+    """Standard deviation of the rotation, from the covariance of the pose."""
+    good_sigma: float = 0.02
+    """Standard deviation of the translation, x scale."""
+    usable: float = 0.2
+    """A pose that scores less is not used."""
+    good: float = 0.4
+    """What it takes to trust tracking again after it was limited or lost."""
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Admission, guesses and trust."""
+
+    guess: str | None = None
+    """Where to begin: a JSON file, train:NAME, or perturb:10-40deg,0.2 (each frame's true pose, disturbed); without
+    it, the training views are tried one after another."""
+    sequence: Literal["video", "photos"] = "video"
+    """Photos have no motion between them: the last pose is the next guess, and no jump is implausible."""
+    depth: int = 2
+    """Frames in flight at once."""
+    passes: int = 3
+    """Most passes over a frame whose guess may be far off: the pose found becomes the next guess."""
+    retries: int = 0
+    """How many other guesses to try on the same frame when one has led nowhere."""
+    seed: int = 0
+    """Of the disturbed guesses."""
+    max_deadline_ms: float = 10_000.0
+    """A pass without a result is given up after this time."""
+    min_deadline_ms: float = 1500.0
+    """It is given up no sooner than this."""
+    deadline_factor: float = 10.0
+    """Between the two limits: after so many times the usual latency of a pass."""
+    guess_wait_ms: float = 500.0
+    """How long a frame may wait for its own guess (perturb, or a file of guesses by frame)."""
+    settled_deg: float = 1.0
+    """A pose this near its guess needs no further pass."""
+    settled: float = 0.005
+    """The same in translation, x scale."""
+    far_deg: float = 12.0
+    """A pose this far from its guess is not believed before another pass has found it again."""
+    far: float = 0.12
+    """The same in translation, x scale."""
+    jump_deg: float = 8.0
+    """A pose further than this from the motion model's is a jump, and waits for a second frame to confirm it."""
+    jump: float = 0.08
+    """The same in translation, x scale."""
+    jump_deg_per_s: float = 180.0
+    """How the allowance grows with the time since the last pose."""
+    jump_per_s: float = 1.0
+    """The same in translation, x scale."""
+    lost_after: int = 5
+    """Frames in a row without a usable pose until tracking is lost."""
+    weak_after: int = 20
+    """Frames in a row with usable but never good poses until it is, once limited."""
+    keyframes: int = 50
+    """Good poses that are remembered."""
+    keyframe_deg: float = 10.0
+    """A pose further than this from every keyframe becomes one."""
+    keyframe: float = 0.1
+    """The same in translation, x scale."""
+    cover_deg: float = 20.0
+    """Relocalisation tries training views until each view is this near one of those tried."""
+    cover: float = 0.3
+    """The same in translation, x scale."""
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    score: ScoreConfig = field(default_factory=ScoreConfig)
+
+    def __post_init__(self) -> None:
+        for name, least in (("depth", 1), ("passes", 1), ("retries", 0), ("lost_after", 1), ("weak_after", 1)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"tracking: {name} is {getattr(self, name)}, but must be at least {least}")
+        for part in (self, self.motion, self.score):
+            _refuse_negative(part)
+
+
+def _refuse_negative(config: object) -> None:
+    for item in fields(config):  # type: ignore[arg-type]
+        value = getattr(config, item.name)
+        if isinstance(value, int | float) and not value >= 0:
+            raise ConfigError(f"tracking: {item.name} is {value}, but must not be negative")

@@ -1,0 +1,159 @@
+"""Tracking: lets frames in at one door, gives each its guesses, and reports what is believed after each.
+
+A pure state machine: every call says what time it is and returns what is to be sent. At all times
+received = admitted + dropped + waiting, and admitted = finished + lost + in flight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.tracking.config import TrackingConfig
+from stages.tracking.policy import Attempt, Belief, FrameInfo, Policy, PoseGuess, PoseResult
+
+_NS_PER_MS = 1e6
+_LATENCY_SMOOTHING = 0.2
+
+
+@dataclass(frozen=True)
+class Counts:
+    """Frames since the start; `late` counts results that came after they had been given up."""
+
+    received: int = 0
+    admitted: int = 0
+    finished: int = 0
+    lost: int = 0
+    dropped_at_the_door: int = 0
+    waiting: int = 0
+    in_flight: int = 0
+    late: int = 0
+
+
+@dataclass(frozen=True)
+class GuessOrder:
+    """Render this pose for this frame and pass."""
+
+    frame: FrameInfo
+    pass_index: int
+    guess: PoseGuess
+
+
+@dataclass(frozen=True)
+class StateReport:
+    """A frame has left: finished, lost on its way, or without a guess; what is believed now."""
+
+    frame: FrameInfo
+    pass_index: int
+    belief: Belief
+    counts: Counts
+
+
+Output = GuessOrder | StateReport
+
+
+class Tracker:
+    """The door, the frames in flight and their deadlines; a Policy makes the guesses."""
+
+    def __init__(self, config: TrackingConfig, policy: Policy) -> None:
+        self._config = config
+        self._policy = policy
+        self._waiting: tuple[FrameInfo, int] | None = None
+        self._in_flight: dict[int, Attempt] = {}
+        self._latency_ms: float | None = None
+        self._received = self._admitted = self._finished = self._lost = self._dropped = self._late = 0
+
+    @property
+    def counts(self) -> Counts:
+        return Counts(
+            received=self._received,
+            admitted=self._admitted,
+            finished=self._finished,
+            lost=self._lost,
+            dropped_at_the_door=self._dropped,
+            waiting=int(self._waiting is not None),
+            in_flight=len(self._in_flight),
+            late=self._late,
+        )
+
+    @property
+    def deadline_ms(self) -> float:
+        """How long a pass may take before its frame is given up."""
+        if self._latency_ms is None:
+            return self._config.max_deadline_ms
+        usual = self._latency_ms * self._config.deadline_factor
+        return min(max(usual, self._config.min_deadline_ms), self._config.max_deadline_ms)
+
+    def on_frame(self, frame: FrameInfo, now_ns: int, missed: int = 0) -> list[Output]:
+        """Take a frame to the door; it replaces one that waits there. `missed`: frames that never came this far."""
+        self._received += 1 + missed
+        self._dropped += missed + int(self._waiting is not None)
+        self._waiting = (frame, now_ns)
+        return self._admit(now_ns)
+
+    def on_truth(self, frame_id: int, cam_from_object: np.ndarray | None, now_ns: int) -> list[Output]:
+        """Take in the true pose of a frame; it may come before the frame or after."""
+        self._policy.on_truth(frame_id, cam_from_object)
+        return self._admit(now_ns)
+
+    def on_pose(self, result: PoseResult, now_ns: int) -> list[Output]:
+        """Take in a result; one that is not of a frame's present pass is late and changes nothing."""
+        attempt = self._in_flight.get(result.frame_id)
+        if attempt is None or attempt.pass_index != result.pass_index:
+            self._late += 1
+            return []
+        self._note_latency(now_ns - attempt.sent_ns)
+        guess = self._policy.next_guess(attempt, result)
+        if guess is not None:
+            attempt = self._in_flight[result.frame_id] = attempt.again(guess, result, now_ns)
+            return [GuessOrder(attempt.frame, attempt.pass_index, guess)]
+        del self._in_flight[result.frame_id]
+        self._finished += 1
+        belief = self._policy.conclude(attempt, result)
+        return [*self._admit(now_ns), self._report(attempt.frame, result.pass_index, belief)]
+
+    def on_tick(self, now_ns: int) -> list[Output]:
+        """Give up what is past its deadline; call it often."""
+        late = [a for a in self._in_flight.values() if now_ns - a.sent_ns > self.deadline_ms * _NS_PER_MS]
+        reports: list[Output] = [self._give_up(attempt, now_ns) for attempt in late]
+        if self._waiting is not None and not self._full() and self._waited_too_long(now_ns):
+            frame, _ = self._waiting
+            self._waiting = None
+            self._dropped += 1
+            reports.append(self._report(frame, 0, self._policy.missed(frame)))
+        return [*self._admit(now_ns), *reports]
+
+    def _admit(self, now_ns: int) -> list[Output]:
+        if self._waiting is None or self._full():
+            return []
+        frame, _ = self._waiting
+        guess = self._policy.first_guess(frame)
+        if guess is None:
+            return []
+        self._waiting = None
+        self._admitted += 1
+        self._in_flight[frame.frame_id] = Attempt(frame, guess, now_ns)
+        return [GuessOrder(frame, 0, guess)]
+
+    def _full(self) -> bool:
+        """No place is free, or the waiting frame's number is still in flight (a camera that began again)."""
+        again = self._waiting is not None and self._waiting[0].frame_id in self._in_flight
+        return again or len(self._in_flight) >= self._config.depth
+
+    def _waited_too_long(self, now_ns: int) -> bool:
+        return self._waiting is not None and now_ns - self._waiting[1] > self._config.guess_wait_ms * _NS_PER_MS
+
+    def _give_up(self, attempt: Attempt, now_ns: int) -> StateReport:
+        del self._in_flight[attempt.frame.frame_id]
+        self._lost += 1
+        self._note_latency(now_ns - attempt.sent_ns)  # or a pipeline that became slow would stay late for ever
+        return self._report(attempt.frame, attempt.pass_index, self._policy.missed(attempt.frame))
+
+    def _note_latency(self, latency_ns: int) -> None:
+        latency_ms = latency_ns / _NS_PER_MS
+        usual = latency_ms if self._latency_ms is None else self._latency_ms
+        self._latency_ms = usual + _LATENCY_SMOOTHING * (latency_ms - usual)
+
+    def _report(self, frame: FrameInfo, pass_index: int, belief: Belief) -> StateReport:
+        return StateReport(frame, pass_index, belief, self.counts)

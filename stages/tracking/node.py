@@ -1,0 +1,57 @@
+"""Tracking as a process: frames, truths and poses in, guesses and states out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+
+from bus.messages import Frame, Message, Pose, Truth
+from bus.node import Output
+from bus.ports import Sequences
+from bus.topics import FRAME, GUESS, POSE, STATE, TRUTH, Topic
+from stages.nerf.field import load_field
+from stages.tracking import core
+from stages.tracking.config import TrackingConfig
+from stages.tracking.guesses import make_policy, needs_truth
+from stages.tracking.views import training_views
+from stages.tracking.wire import copied, frame_info, outputs_of, pose_result
+
+
+class TrackingNode:
+    """A Handler around the Tracker. Raises FieldFileError and ConfigError at start."""
+
+    name = "tracking"
+    outputs: tuple[Topic, ...] = (GUESS, STATE)
+
+    def __init__(self, field: Path, config: TrackingConfig) -> None:
+        self.inputs: tuple[Topic, ...] = (FRAME, POSE, TRUTH) if needs_truth(config.guess) else (FRAME, POSE)
+        self._field = field
+        self._config = config
+        self._sequences = Sequences()
+
+    def start(self) -> None:
+        views = training_views(load_field(self._field).metadata)
+        self._tracker = core.Tracker(self._config, make_policy(self._config, views))
+
+    def handle(self, topic: Topic, message: Message) -> Iterable[Output]:
+        return outputs_of(self._take_in(message, time.time_ns()))
+
+    def tick(self, now_ns: int) -> Iterable[Output]:
+        return outputs_of(self._tracker.on_tick(now_ns))
+
+    def stop(self) -> None:
+        """Nothing is held."""
+
+    def _take_in(self, message: Message, now_ns: int) -> list[core.Output]:
+        match message:
+            case Frame():
+                missed = self._sequences.seen(FRAME.name, message.header)
+                return self._tracker.on_frame(frame_info(message), now_ns, missed)
+            case Truth():
+                truth = copied(message.cam_from_object)
+                return self._tracker.on_truth(message.header.frame_id, truth, now_ns)
+            case Pose():
+                return self._tracker.on_pose(pose_result(message), now_ns)
+            case _:
+                raise TypeError(f"tracking takes no {type(message).__name__}")

@@ -1,0 +1,134 @@
+"""Poses to fall back on: the training views of a field, good poses of this run, and an order to try them in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.errors import ConfigError
+from stages.nerf.datasets import find_name
+from stages.nerf.metadata import FieldMetadata
+from stages.tracking.distance import Limit, centres_of, pairwise
+
+
+@dataclass(frozen=True)
+class TrainingViews:
+    """The views that a field was learnt from: names, and cam_from_object (n, 4, 4)."""
+
+    names: tuple[str, ...]
+    cam_from_object: np.ndarray
+
+    @property
+    def scale(self) -> float:
+        """The spread of the cameras (median distance to their mean) in object units; 1 for fewer than two."""
+        if len(self.cam_from_object) < 2:
+            return 1.0
+        centres = centres_of(self.cam_from_object)
+        spread = float(np.median(np.linalg.norm(centres - centres.mean(axis=0), axis=1)))
+        return spread if spread > 1e-9 else 1.0
+
+    def pose_of(self, name: str) -> np.ndarray:
+        """cam_from_object of the view of that name (see find_name). DatasetError or ConfigError if there is none."""
+        if not self.names:
+            raise ConfigError(f"the field does not tell its training views, so train:{name} means nothing")
+        return self.cam_from_object[self.names.index(find_name(list(self.names), name))]
+
+
+def training_views(metadata: FieldMetadata) -> TrainingViews:
+    """The training views that a field file tells of."""
+    poses = [np.reshape(camera.cam_from_object, (4, 4)) for camera in metadata.cameras]
+    names = tuple(camera.name for camera in metadata.cameras)
+    return TrainingViews(names, np.array(poses, dtype=np.float64).reshape(-1, 4, 4))
+
+
+def farthest_point_order(poses: np.ndarray, limit: Limit) -> list[int]:
+    """Indices of poses (n, 4, 4): first the most central, then always the one farthest from those chosen.
+
+    Ends as soon as every pose lies within the limit of a chosen one.
+    Source: Gonzalez, Clustering to minimize the maximum intercluster distance (1985).
+    """
+    if len(poses) == 0:
+        return []
+    distances = pairwise(poses, poses, limit)
+    chosen = [int(distances.mean(axis=1).argmin())]
+    nearest = distances[chosen[0]]
+    while nearest.max() > 1.0:
+        chosen.append(int(nearest.argmax()))
+        nearest = np.minimum(nearest, distances[chosen[-1]])
+    return chosen
+
+
+class Keyframes:
+    """The newest good poses that lie apart from one another, at most `capacity`."""
+
+    def __init__(self, limit: Limit, capacity: int) -> None:
+        self._limit = limit
+        self._capacity = capacity
+        self._poses: list[np.ndarray] = []
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    def add(self, cam_from_object: np.ndarray) -> None:
+        """Remember a good pose unless one near it is remembered; beyond the capacity the oldest goes."""
+        if self._poses and self._distances(cam_from_object).min() <= 1.0:
+            return
+        self._poses = [*self._poses, cam_from_object][-self._capacity :] if self._capacity else []
+
+    def nearest(self, cam_from_object: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+        """The keyframe nearest to a pose; `otherwise` without any."""
+        return self._poses[int(self._distances(cam_from_object).argmin())] if self._poses else otherwise
+
+    def newest(self, count: int) -> list[np.ndarray]:
+        """The newest first."""
+        return self._poses[-count:][::-1] if count else []
+
+    def _distances(self, cam_from_object: np.ndarray) -> np.ndarray:
+        return pairwise(cam_from_object[None], np.stack(self._poses), self._limit)[0]
+
+
+class Relocaliser:
+    """Endless guesses while nothing is known: by turns a pose near where the camera was, and a training view.
+
+    ConfigError if there is no pose at all to try.
+    """
+
+    def __init__(self, views: TrainingViews, limit: Limit, near: Sequence[np.ndarray] = ()) -> None:
+        order = farthest_point_order(views.cam_from_object, limit)
+        self._far = [views.cam_from_object[i] for i in order]
+        self.restart(near)
+        self._next_far = 0
+        if self.lap == 0:
+            raise ConfigError(
+                "tracking has no pose to begin with: give --guess FILE, or a field with training views"
+            )
+
+    @property
+    def lap(self) -> int:
+        """Guesses until all poses have been tried."""
+        return len(self._far) + len(self._near)
+
+    def restart(self, near: Sequence[np.ndarray]) -> None:
+        """Begin again with these poses, most likely first; the training views go on where they were."""
+        self._near = list(near)
+        self._pushed: np.ndarray | None = None
+        self._turn = self._next_near = 0
+
+    def push(self, cam_from_object: np.ndarray) -> None:
+        """Try this pose next, once: it was found, but not confirmed."""
+        self._pushed = cam_from_object
+
+    def next(self) -> np.ndarray:
+        """The next pose to try."""
+        if self._pushed is not None:
+            pushed, self._pushed = self._pushed, None
+            return pushed
+        near_turn = bool(self._near) and (self._turn % 2 == 0 or not self._far)
+        self._turn += 1
+        if near_turn:
+            self._next_near += 1
+            return self._near[(self._next_near - 1) % len(self._near)]
+        self._next_far += 1
+        return self._far[(self._next_far - 1) % len(self._far)]

@@ -5,13 +5,11 @@ A stage implements Handler, or JoinedHandler where it needs several inputs of a 
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from types import FrameType
 from typing import Protocol
 
 import numpy as np
@@ -22,6 +20,7 @@ from bus.joining import Joined, Joiner, kept
 from bus.logs import Throttle, stage_logger
 from bus.messages import Header, Message, Reason, Stats
 from bus.ports import Inbox, InboxCounts, Outbox, first_header, reply_header
+from bus.signals import Interrupted, StopSignals
 from bus.topics import FRAME, STATS, Address, Topic
 from bus.transport import Bus
 
@@ -139,36 +138,8 @@ def run_node(
 
     An exception of `handler.start` is raised; one of `handle` or `tick` is counted, logged and survived.
     """
-    with _Signals(stop or threading.Event()) as signals:
+    with StopSignals(stop) as signals:
         _Node(handler, bus, address, signals.stop, stats_period_s).run(signals)
-
-
-class _Interrupted(BaseException):
-    """A signal to stop, while `start` is at work and nobody looks at the event."""
-
-
-class _Signals:
-    """SIGTERM and SIGINT set `stop`; while `interrupting`, they also break into what the main thread is doing."""
-
-    def __init__(self, stop: threading.Event) -> None:
-        self.stop = stop
-        self.interrupting = False
-        self._before: dict[int, object] = {}
-
-    def __enter__(self) -> _Signals:
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGTERM, signal.SIGINT):
-                self._before[number] = signal.signal(number, self._caught)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, before in self._before.items():
-            signal.signal(number, before)  # type: ignore[arg-type]
-
-    def _caught(self, number: int, frame: FrameType | None) -> None:
-        self.stop.set()
-        if self.interrupting:
-            raise _Interrupted
 
 
 class _Node:
@@ -188,7 +159,7 @@ class _Node:
         self._process = psutil.Process()
         self._next_tick = self._next_stats = 0.0
 
-    def run(self, signals: _Signals) -> None:
+    def run(self, signals: StopSignals) -> None:
         self._send_stats(ready=False)
         try:
             signals.interrupting = True
@@ -197,7 +168,7 @@ class _Node:
             signals.interrupting = False
             if not self._stop.is_set():
                 self._serve()
-        except (_Interrupted, EndOfInput):
+        except (Interrupted, EndOfInput):
             pass
         finally:
             signals.interrupting = False

@@ -1,156 +1,192 @@
-"""Carrying bytes between processes: the Bus protocol, and MemoryBus, which does it inside one process."""
+"""The bus between processes and hosts, over Zenoh; the only place that knows Zenoh."""
 
 from __future__ import annotations
 
+import json
+import os
+import re
+import shutil
+import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import zenoh
 
 from bus.errors import TransportError
-from bus.topics import Address, Topic
+from bus.memory import MemoryBus
+from bus.protocol import Bus, Closer, Closing, Sink, Watcher, wait_for
+from bus.signals import StopSignals
+from bus.topics import Topic
 
-T = TypeVar("T")
+__all__ = [
+    "LOCAL_HUB", "Bus", "Closing", "MemoryBus", "Sink", "Watcher", "ZenohBus", "log_to_stderr", "serve_hub",
+    "wait_for",
+]  # fmt: skip
 
-Sink = Callable[[str, bytes, int], None]
-"""Takes (key, payload, time of receipt in ns); is called from the bus's own threads and returns at once."""
-
-Watcher = Callable[[str, bool], None]
-"""Takes (key, alive) of a liveliness token that appeared or disappeared."""
-
-
-class Closing(Protocol):
-    """Something that was declared on a bus and ends with `close`."""
-
-    def close(self) -> None: ...
-
-
-class Bus(Protocol):
-    """Bytes by key, and tokens that live as long as their process; a "*" in a key listens to any one part."""
-
-    def put(self, key: str, payload: bytes, topic: Topic) -> None:
-        """Send with the topic's priority and congestion control; nobody says whether it was received."""
-
-    def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:
-        """Give what arrives to `sink`; while that is held up, `capacity` messages wait (1: the newest)."""
-
-    def hold(self, key: str) -> Closing:
-        """Hold a liveliness token until closed, or until this process dies."""
-
-    def live(self, key: str) -> set[str]:
-        """The tokens held now by anyone."""
-
-    def watch(self, key: str, watcher: Watcher) -> Closing:
-        """Tell `watcher` of the tokens held now and of each change."""
-
-    def close(self) -> None: ...
+LOCAL_HUB = "tcp/127.0.0.1:7447"
+_LOCAL_PEER = "tcp/127.0.0.1:0"
+_POOL_BYTES = 128 << 20
+_ENDPOINT = re.compile(r"[a-z]+/.+:\d{1,5}([?#].*)?")
+_PRIORITIES = {"data": zenoh.Priority.DATA, "data_low": zenoh.Priority.DATA_LOW}
+_CONGESTION = {"block_first": zenoh.CongestionControl.BLOCK_FIRST, "drop": zenoh.CongestionControl.DROP}
 
 
-@dataclass
-class _Room:
-    """What MemoryBus sessions share; sinks and watchers are called from the thread that puts."""
+class ZenohBus:
+    """A bus over Zenoh: a peer that finds the others through the hub, and returns by itself after the hub's death.
 
-    lock: threading.RLock = field(default_factory=threading.RLock)
-    sinks: list[tuple[str, Sink]] = field(default_factory=list)
-    tokens: list[str] = field(default_factory=list)
-    watchers: list[tuple[str, Watcher]] = field(default_factory=list)
+    `hub` and `listen` are endpoints ("tcp/host:port", "tls/host:port"); `settings` adds to Zenoh's configuration by
+    path, for instance {"transport/auth/usrpwd/user": "..."}. Raises TransportError where these cannot be used; a
+    hub that is not there yet is no error, see `wait_for_hub`.
+    """
 
+    def __init__(
+        self, hub: str = LOCAL_HUB, listen: str = _LOCAL_PEER, settings: Mapping[str, Any] | None = None
+    ) -> None:
+        self._hub = _endpoint(hub)
+        peer = {
+            "mode": "peer",
+            "connect/endpoints": [self._hub],
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+            "listen/endpoints": [_endpoint(listen)],
+            "transport/shared_memory/transport_optimization/pool_size": _POOL_BYTES,
+            "transport/shared_memory/transport_optimization/enabled": _shared_memory_fits(),
+        }
+        self._session = _open({**peer, **(settings or {})}, f"cannot use hub {hub} and listen on {listen}")
+        self._publishers: dict[str, Any] = {}
+        self._mine: list[Closer] = []
 
-class _Closer:
-    """Runs its action the first time that it is closed."""
-
-    def __init__(self, action: Callable[[], None]) -> None:
-        self._action: Callable[[], None] | None = action
-
-    def close(self) -> None:
-        action, self._action = self._action, None
-        if action is not None:
-            action()
-
-
-class MemoryBus:
-    """A bus between the threads of one process; a second session joins the first as its neighbour."""
-
-    def __init__(self, neighbour: MemoryBus | None = None) -> None:
-        self._room: _Room = neighbour._room if neighbour is not None else _Room()
-        self._mine: list[_Closer] = []
+    def wait_for_hub(self, timeout_s: float) -> None:
+        """Return once the hub answers. Raises TransportError after `timeout_s`."""
+        deadline = time.monotonic() + timeout_s
+        while not self._session.info.routers_zid():
+            if time.monotonic() > deadline:
+                raise TransportError(
+                    f"no hub answers at {self._hub} after {timeout_s:g} s; start it, or name its address"
+                )
+            time.sleep(0.005)
 
     def put(self, key: str, payload: bytes, topic: Topic) -> None:
-        with self._room.lock:
-            sinks = [sink for pattern, sink in self._room.sinks if _matches(pattern, key)]
-        now_ns = time.time_ns()
-        for sink in sinks:
-            sink(key, payload, now_ns)
+        try:
+            publisher = self._publishers.get(key)
+            if publisher is None:
+                publisher = self._publishers[key] = self._session.declare_publisher(
+                    key, priority=_PRIORITIES[topic.priority], congestion_control=_CONGESTION[topic.congestion]
+                )
+            publisher.put(payload)
+        except zenoh.ZError as error:
+            raise TransportError(f"cannot send on {key}: {_reason(error)}") from error
 
     def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:
-        return self._enter(self._room.sinks, (key, sink))
+        channel: Any = zenoh.handlers.RingChannel(1) if capacity == 1 else zenoh.handlers.FifoChannel(capacity)
+        subscriber = self._session.declare_subscriber(key, channel)
+        # Zenoh's channel keeps the newest while Python is busy; copying out at once frees shared memory.
+        thread = threading.Thread(target=_feed, args=(subscriber.handler, sink), name=f"feed {key}", daemon=True)
+        thread.start()
+
+        def end() -> None:
+            subscriber.undeclare()
+            thread.join()
+
+        return self._closer(end)
 
     def hold(self, key: str) -> Closing:
-        with self._room.lock:
-            self._room.tokens.append(key)
-            self._tell(key, True)
-        return self._closer(lambda: self._release(key))
+        return self._closer(self._session.liveliness().declare_token(key).undeclare)
 
     def live(self, key: str) -> set[str]:
-        with self._room.lock:
-            return {token for token in self._room.tokens if _matches(key, token)}
+        replies = self._session.liveliness().get(key, timeout=1.0)
+        return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
     def watch(self, key: str, watcher: Watcher) -> Closing:
-        with self._room.lock:
-            for token in sorted(self.live(key)):
-                watcher(token, True)
-            return self._enter(self._room.watchers, (key, watcher))
+        def changed(sample: Any) -> None:
+            watcher(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        return self._closer(self._session.liveliness().declare_subscriber(key, changed, history=True).undeclare)
 
     def close(self) -> None:
         for closer in self._mine:
             closer.close()
-
-    def _enter(self, place: list[T], entry: T) -> Closing:
-        with self._room.lock:
-            place.append(entry)
-        return self._closer(lambda: place.remove(entry))
-
-    def _release(self, key: str) -> None:
-        with self._room.lock:
-            self._room.tokens.remove(key)
-            if key not in self._room.tokens:
-                self._tell(key, False)
-
-    def _tell(self, key: str, alive: bool) -> None:
-        for pattern, watcher in list(self._room.watchers):
-            if _matches(pattern, key):
-                watcher(key, alive)
+        self._session.close()
 
     def _closer(self, action: Callable[[], None]) -> Closing:
-        closer = _Closer(action)
+        closer = Closer(action)
         self._mine.append(closer)
         return closer
 
 
-def _matches(pattern: str, key: str) -> bool:
-    parts, others = pattern.split("/"), key.split("/")
-    return len(parts) == len(others) and all(a in ("*", b) for a, b in zip(parts, others, strict=True))
+def _feed(channel: Any, sink: Sink) -> None:
+    while True:
+        try:
+            sample = channel.recv()
+        except zenoh.ZError:
+            return
+        key, payload = str(sample.key_expr), sample.payload.to_bytes()
+        del sample
+        sink(key, payload, time.time_ns())
 
 
-def wait_for(bus: Bus, address: Address, stages: Iterable[str], timeout_s: float) -> None:
-    """Return once each of `stages` is ready on the bus. Raises TransportError that names those which are not."""
-    wanted = {address.live(stage): stage for stage in stages}
-    changed = threading.Condition()
-    alive: set[str] = set()
+def serve_hub(
+    listen: str = LOCAL_HUB, settings: Mapping[str, Any] | None = None, stop: threading.Event | None = None
+) -> None:
+    """Be the meeting point of all processes until SIGTERM, SIGINT or `stop`.
 
-    def watcher(key: str, is_alive: bool) -> None:
-        with changed:
-            (alive.add if is_alive else alive.discard)(key)
-            changed.notify()
+    Raises TransportError where it cannot listen, as on a port in use.
+    """
+    router = {"mode": "router", "listen/endpoints": [_endpoint(listen)]}
+    what = f"no hub at {listen}: is another one running there, or another program? Choose a free port"
+    with StopSignals(stop) as signals:
+        session = _open({**router, **(settings or {})}, what)
+        try:
+            signals.stop.wait()
+        finally:
+            session.close()
 
-    watching = bus.watch(address.live("*"), watcher)
+
+def log_to_stderr(level: str = "error") -> None:
+    """Turn on Zenoh's log, the only place that tells why a connection was refused, on stderr.
+
+    Zenoh writes it to the process's standard output: that descriptor becomes stderr's, while `sys.stdout` keeps a
+    copy of the old one. To be called once, by a process of our own and before it prints.
+    """
+    sys.stdout.flush()
+    sys.stdout = os.fdopen(os.dup(1), "w", buffering=1)
+    os.dup2(2, 1)
+    zenoh.init_log_from_env_or(level)
+
+
+def _open(values: Mapping[str, Any], what: str) -> Any:
+    common = {
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": True,
+        "transport/link/tx/lease": 2000,
+        "transport/shared_memory/enabled": True,
+    }
+    config = zenoh.Config()
     try:
-        deadline = time.monotonic() + timeout_s
-        with changed:
-            if changed.wait_for(lambda: wanted.keys() <= alive, deadline - time.monotonic()):
-                return
-            missing = ", ".join(sorted(stage for key, stage in wanted.items() if key not in alive))
-    finally:
-        watching.close()
-    raise TransportError(f"not ready on the bus after {timeout_s:g} s: {missing}; is each of them running?")
+        for path, value in {**common, **values}.items():
+            config.insert_json5(path, json.dumps(value))
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise TransportError(f"{what}: {_reason(error)}") from error
+
+
+def _endpoint(text: str) -> str:
+    if not _ENDPOINT.fullmatch(text):
+        raise TransportError(f"{text!r} is no address of a hub; expected for instance {LOCAL_HUB}")
+    return text
+
+
+def _shared_memory_fits() -> bool:
+    # A pool that outgrows /dev/shm (64 MB in many containers) ends the process with SIGBUS.
+    try:
+        return shutil.disk_usage("/dev/shm").free >= 2 * _POOL_BYTES
+    except OSError:
+        return False
+
+
+def _reason(error: Exception) -> str:
+    """Zenoh's message without the places in its source."""
+    return re.sub(r" at /\S+", "", str(error)).strip()

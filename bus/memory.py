@@ -1,0 +1,88 @@
+"""A bus inside one process, for tests and for running without a hub."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from bus.protocol import Closer, Closing, Sink, Watcher
+from bus.topics import Topic
+
+T = TypeVar("T")
+
+
+@dataclass
+class _Room:
+    """What MemoryBus sessions share; sinks and watchers are called from the thread that puts."""
+
+    lock: threading.RLock = field(default_factory=threading.RLock)
+    sinks: list[tuple[str, Sink]] = field(default_factory=list)
+    tokens: list[str] = field(default_factory=list)
+    watchers: list[tuple[str, Watcher]] = field(default_factory=list)
+
+
+class MemoryBus:
+    """A bus between the threads of one process; a second session joins the first as its neighbour."""
+
+    def __init__(self, neighbour: MemoryBus | None = None) -> None:
+        self._room: _Room = neighbour._room if neighbour is not None else _Room()
+        self._mine: list[Closer] = []
+
+    def put(self, key: str, payload: bytes, topic: Topic) -> None:
+        with self._room.lock:
+            sinks = [sink for pattern, sink in self._room.sinks if _matches(pattern, key)]
+        now_ns = time.time_ns()
+        for sink in sinks:
+            sink(key, payload, now_ns)
+
+    def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:
+        return self._enter(self._room.sinks, (key, sink))
+
+    def hold(self, key: str) -> Closing:
+        with self._room.lock:
+            self._room.tokens.append(key)
+            self._tell(key, True)
+        return self._closer(lambda: self._release(key))
+
+    def live(self, key: str) -> set[str]:
+        with self._room.lock:
+            return {token for token in self._room.tokens if _matches(key, token)}
+
+    def watch(self, key: str, watcher: Watcher) -> Closing:
+        with self._room.lock:
+            for token in sorted(self.live(key)):
+                watcher(token, True)
+            return self._enter(self._room.watchers, (key, watcher))
+
+    def close(self) -> None:
+        for closer in self._mine:
+            closer.close()
+
+    def _enter(self, place: list[T], entry: T) -> Closing:
+        with self._room.lock:
+            place.append(entry)
+        return self._closer(lambda: place.remove(entry))
+
+    def _release(self, key: str) -> None:
+        with self._room.lock:
+            self._room.tokens.remove(key)
+            if key not in self._room.tokens:
+                self._tell(key, False)
+
+    def _tell(self, key: str, alive: bool) -> None:
+        for pattern, watcher in list(self._room.watchers):
+            if _matches(pattern, key):
+                watcher(key, alive)
+
+    def _closer(self, action: Callable[[], None]) -> Closing:
+        closer = Closer(action)
+        self._mine.append(closer)
+        return closer
+
+
+def _matches(pattern: str, key: str) -> bool:
+    parts, others = pattern.split("/"), key.split("/")
+    return len(parts) == len(others) and all(a in ("*", b) for a, b in zip(parts, others, strict=True))

@@ -1,0 +1,79 @@
+"""What a bus can do, whatever carries the bytes."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Protocol
+
+from bus.errors import TransportError
+from bus.topics import Address, Topic
+
+Sink = Callable[[str, bytes, int], None]
+"""Takes (key, payload, time of receipt in ns); is called from the bus's own threads and returns at once."""
+
+Watcher = Callable[[str, bool], None]
+"""Takes (key, alive) of a liveliness token that appeared or disappeared."""
+
+
+class Closing(Protocol):
+    """Something that was declared on a bus and ends with `close`."""
+
+    def close(self) -> None: ...
+
+
+class Bus(Protocol):
+    """Bytes by key, and tokens that live as long as their process; a "*" in a key listens to any one part."""
+
+    def put(self, key: str, payload: bytes, topic: Topic) -> None:
+        """Send with the topic's priority and congestion control; nobody says whether it was received."""
+
+    def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:
+        """Give what arrives to `sink`; while that is held up, `capacity` messages wait (1: the newest)."""
+
+    def hold(self, key: str) -> Closing:
+        """Hold a liveliness token until closed, or until this process dies."""
+
+    def live(self, key: str) -> set[str]:
+        """The tokens held now by anyone."""
+
+    def watch(self, key: str, watcher: Watcher) -> Closing:
+        """Tell `watcher` of the tokens held now and of each change."""
+
+    def close(self) -> None: ...
+
+
+class Closer:
+    """Runs its action the first time that it is closed."""
+
+    def __init__(self, action: Callable[[], None]) -> None:
+        self._action: Callable[[], None] | None = action
+
+    def close(self) -> None:
+        action, self._action = self._action, None
+        if action is not None:
+            action()
+
+
+def wait_for(bus: Bus, address: Address, stages: Iterable[str], timeout_s: float) -> None:
+    """Return once each of `stages` is ready on the bus. Raises TransportError that names those which are not."""
+    wanted = {address.live(stage): stage for stage in stages}
+    changed = threading.Condition()
+    alive: set[str] = set()
+
+    def watcher(key: str, is_alive: bool) -> None:
+        with changed:
+            (alive.add if is_alive else alive.discard)(key)
+            changed.notify()
+
+    watching = bus.watch(address.live("*"), watcher)
+    try:
+        deadline = time.monotonic() + timeout_s
+        with changed:
+            if changed.wait_for(lambda: wanted.keys() <= alive, deadline - time.monotonic()):
+                return
+            missing = ", ".join(sorted(stage for key, stage in wanted.items() if key not in alive))
+    finally:
+        watching.close()
+    raise TransportError(f"not ready on the bus after {timeout_s:g} s: {missing}; is each of them running?")

@@ -1,0 +1,55 @@
+"""Settings of the radiance field and of its training."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class FieldConfig:
+    """Shape of the networks; stored with a field, so that any build can render it.
+
+    The density network maps the hash encoding to a density and `features` numbers. The first three features are the
+    view-independent colour; all of them, composited along the ray, and the view direction go once per ray through the
+    colour network, which adds the view-dependent part (deferred shading as in Hedman et al., "Baking Neural Radiance
+    Fields for Real-Time View Synthesis", 2021).
+    """
+
+    levels: int = 8
+    """Resolutions of the hash grid."""
+    level_features: int = 4
+    """Features of a table entry."""
+    log2_table: int = 17
+    """Entries of a level's table, as a power of two; coarse levels that need fewer are stored densely."""
+    base_resolution: int = 16
+    finest_resolution: int = 1024
+    hidden: int = 64
+    """Width of the density network's hidden layer."""
+    features: int = 15
+    """Features composited along a ray; at least 3."""
+    colour_hidden: int = 32
+    """Width of the colour network's two hidden layers."""
+    occupancy_resolution: int = 128
+    """Cells of the occupancy grid along an axis; a multiple of 8."""
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How a field is learnt."""
+
+    minutes: float = 5.0
+    """Wall-clock time of the training loop."""
+    steps: int | None = None
+    """Stop after so many steps instead."""
+    seed: int = 0
+    samples_per_step: int = 1 << 16
+    """Rays are added to a step until they carry about so many samples."""
+    learning_rate: float = 1e-2
+    final_learning_rate: float = 5e-4
+    distortion: float = 1e-3
+    """Weight of the loss that gathers a ray's weights around one depth (Barron et al., "Mip-NeRF 360", 2022)."""
+    huber_delta: float = 0.1
+    threads: int = 0
+    """Threads of the kernels; 0 takes all cores."""
+    validation_views: int = 4
+    """Held-out views that the progress bar's PSNR is measured on."""

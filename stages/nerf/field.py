@@ -1,0 +1,120 @@
+"""A radiance field: its parameters, what is occupied, and its file."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from stages.errors import FieldFileError
+from stages.nerf.config import FieldConfig
+from stages.nerf.kernels.types import SH_SIZE, Domain, Net
+from stages.nerf.metadata import FORMAT_VERSION, FieldMetadata, Space
+from stages.nerf.occupancy import pack
+
+LEARNT = ("table", "w1", "w2", "c1", "c2", "c3")
+
+
+@dataclass
+class Field:
+    """`net` holds the learnt arrays; `occupied` is (n, n, n) bool, indexed [z, y, x] over the unit cube."""
+
+    metadata: FieldMetadata
+    net: Net
+    occupied: np.ndarray
+
+    def domain(self) -> Domain:
+        """The domain that the kernels march through."""
+        return domain_of(self.metadata.space, self.occupied)
+
+    def save(self, path: Path) -> None:
+        """Write a safetensors file; the tables are stored in half precision. The old file stays if this fails."""
+        arrays = {name: getattr(self.net, name) for name in LEARNT}
+        arrays["table"] = arrays["table"].astype(np.float16)
+        arrays["occupied"] = np.packbits(self.occupied.ravel(), bitorder="little")
+        text = msgspec.json.encode(self.metadata).decode()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_name(path.name + ".partial")
+        save_file(arrays, partial, metadata={"fieldpose": text, "version": str(FORMAT_VERSION)})
+        os.replace(partial, path)
+
+
+def domain_of(space: Space, occupied: np.ndarray) -> Domain:
+    """Pack the occupancy for the kernels."""
+    bits, coarse = pack(occupied)
+    half = np.array(space.half, np.float32)
+    return Domain(
+        space.contracted, half, space.step, space.near, space.far, bits, coarse, occupied.shape[0]
+    )  # fmt: skip
+
+
+def grid_layout(config: FieldConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Offsets, resolutions and masks of the levels (int64), and the entries of all tables together."""
+    growth = (config.finest_resolution / config.base_resolution) ** (1 / max(config.levels - 1, 1))
+    resolutions = np.array([int(config.base_resolution * growth**i + 1e-6) for i in range(config.levels)], np.int64)
+    table = 1 << config.log2_table
+    dense = (resolutions + 1) ** 3 <= table
+    sizes = np.where(dense, (resolutions + 1) ** 3, table)
+    offsets = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
+    return offsets, resolutions, np.where(dense, -1, table - 1).astype(np.int64), int(sizes.sum())
+
+
+def new_net(config: FieldConfig, rng: np.random.Generator) -> Net:
+    """Random parameters: tables near zero, layers scaled by their width (He et al., 2015)."""
+    offsets, resolutions, masks, entries = grid_layout(config)
+    inputs = config.levels * config.level_features
+
+    def layer(rows: int, columns: int) -> np.ndarray:
+        bound = np.sqrt(6 / rows) if columns > 4 else np.sqrt(3 / rows)
+        return rng.uniform(-bound, bound, (rows, columns)).astype(np.float32)
+
+    return Net(
+        table=rng.uniform(-1e-4, 1e-4, (entries, config.level_features)).astype(np.float32),
+        w1=layer(inputs, config.hidden),
+        w2=layer(config.hidden, 1 + config.features),
+        c1=layer(config.features + SH_SIZE, config.colour_hidden),
+        c2=layer(config.colour_hidden, config.colour_hidden),
+        c3=layer(config.colour_hidden, 3),
+        offsets=offsets,
+        resolutions=resolutions,
+        masks=masks,
+    )
+
+
+def load_field(path: Path) -> Field:
+    """Read a field file. Raises FieldFileError, naming the file, for anything that is not one of this version."""
+    if not path.is_file():
+        raise FieldFileError(f"{path}: no such field file; `fieldpose train DATASET --out {path}` makes one")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            header = file.metadata() or {}
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+    except (SafetensorError, OSError) as error:
+        raise FieldFileError(f"{path}: not a safetensors field file ({error}); train it again") from error
+    if header.get("version") != str(FORMAT_VERSION) or "fieldpose" not in header:
+        got = header.get("version", "none")
+        raise FieldFileError(
+            f"{path}: field format version {got}, this program reads {FORMAT_VERSION}; train the field again"
+        )
+    try:
+        return _assemble(arrays, msgspec.json.decode(header["fieldpose"], type=FieldMetadata))
+    except (msgspec.DecodeError, KeyError, ValueError) as error:
+        raise FieldFileError(f"{path}: damaged field file ({error}); train it again") from error
+
+
+def _assemble(arrays: dict[str, np.ndarray], metadata: FieldMetadata) -> Field:
+    config = metadata.config
+    template = new_net(config, np.random.default_rng(0))
+    learnt = {name: np.ascontiguousarray(arrays[name], dtype=np.float32) for name in LEARNT}
+    for name, array in learnt.items():
+        expected = getattr(template, name).shape
+        if array.shape != expected or not np.all(np.isfinite(array)):
+            raise ValueError(f"array {name} has shape {array.shape} or values that are not finite, expected {expected}")
+    n = config.occupancy_resolution
+    occupied = np.unpackbits(arrays["occupied"], bitorder="little", count=n**3).astype(bool).reshape(n, n, n)
+    return Field(metadata, template._replace(**learnt), occupied)

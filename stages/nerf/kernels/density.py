@@ -1,0 +1,21 @@
+"""Density at points, for the occupancy grid."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from stages.nerf.kernels.packet import density, density_network
+from stages.nerf.kernels.types import FASTMATH, Net, Samples
+
+
+@njit(nogil=True, fastmath=FASTMATH, cache=True)
+def densities(net: Net, u: np.ndarray, first: int, last: int, samples: Samples, out: np.ndarray) -> None:
+    """Fill out[first:last] with the density at u (n, 3) in the unit cube."""
+    size = min(samples.t.shape[0], 256)
+    for start in range(first, last, size):
+        count = min(size, last - start)
+        samples.u[:count] = u[start : start + count]
+        density_network(net, samples, 0, count)
+        for s in range(count):
+            out[start + s] = density(samples.out[s, 0])

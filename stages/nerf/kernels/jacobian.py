@@ -1,0 +1,119 @@
+"""Colour and its derivative with respect to the ray, for the refinement of poses."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from stages.nerf.kernels.backward import (
+    colour_backward,
+    compact,
+    composite_backward,
+    density_backward,
+    shade_backward,
+)
+from stages.nerf.kernels.encoding import position_gradient
+from stages.nerf.kernels.packet import forward, shade
+from stages.nerf.kernels.space import cube_gradient
+from stages.nerf.kernels.types import FASTMATH, SH_SIZE, Domain, Net, Rays, Samples
+
+
+@njit(nogil=True, fastmath=FASTMATH)
+def harmonics_gradient(d: np.ndarray, g: np.ndarray, at: int, out: np.ndarray) -> None:
+    """Add to out (3,) the gradient with respect to the unit direction of the harmonics with gradient g[at:at + 16]."""
+    x, y, z = d[0], d[1], d[2]
+    xx, yy, zz = x * x, y * y, z * z
+    out[0] += (
+        -0.48860251 * g[at + 3] + 1.09254843 * (y * g[at + 4] - z * g[at + 7] + x * g[at + 8])
+        - 3.54026154 * x * y * g[at + 9] + 2.89061144 * y * z * g[at + 10]
+        + 0.45704580 * (1 - 5 * zz) * g[at + 13] + 2.89061144 * z * x * g[at + 14]
+        + 1.77013077 * (yy - xx) * g[at + 15]
+    )  # fmt: skip
+    out[1] += (
+        -0.48860251 * g[at + 1] + 1.09254843 * (x * g[at + 4] - z * g[at + 5] - y * g[at + 8])
+        + 1.77013077 * (yy - xx) * g[at + 9] + 2.89061144 * x * z * g[at + 10]
+        + 0.45704580 * (1 - 5 * zz) * g[at + 11] - 2.89061144 * z * y * g[at + 14]
+        + 3.54026154 * x * y * g[at + 15]
+    )  # fmt: skip
+    out[2] += (
+        0.48860251 * g[at + 2] - 1.09254843 * (y * g[at + 5] + x * g[at + 7]) + 1.89234942 * z * g[at + 6]
+        + 2.89061144 * x * y * g[at + 10] - 4.57045800 * z * (y * g[at + 11] + x * g[at + 13])
+        + 0.37317633 * (15 * zz - 3) * g[at + 12] + 1.44530572 * (xx - yy) * g[at + 14]
+    )  # fmt: skip
+
+
+@njit(nogil=True, fastmath=FASTMATH)
+def ray_gradients(
+    net: Net,
+    contracted: bool,
+    directions: np.ndarray,
+    start: int,
+    count: int,
+    rows: int,
+    samples: Samples,
+    rays: Rays,
+    jacobian: np.ndarray,
+    k: int,
+) -> None:
+    """Add up the samples' gradients into jacobian[start:start + count, k]: origin, then unit direction."""
+    du, dy = np.empty(3, np.float32), np.empty(3, np.float32)
+    features = rays.feats.shape[1] - SH_SIZE
+    for r in range(count):
+        harmonics_gradient(directions[start + r], rays.dfeats[r], features, jacobian[start + r, k, 3:])
+    for s in range(rows):
+        position_gradient(net, samples.u, samples.dx, s, du)
+        cube_gradient(contracted, samples.y[s], du, dy)
+        r = start + samples.ray[s]
+        for a in range(3):
+            jacobian[r, k, a] += dy[a]
+            jacobian[r, k, 3 + a] += dy[a] * samples.t[s]
+
+
+@njit(nogil=True, fastmath=FASTMATH, cache=True)
+def render_jacobian(
+    net: Net,
+    dom: Domain,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    jitter: np.ndarray,
+    background: np.ndarray,
+    channel_weights: np.ndarray,
+    first: int,
+    last: int,
+    per_ray: int,
+    stop_below: float,
+    samples: Samples,
+    rays: Rays,
+    rgb: np.ndarray,
+    depth: np.ndarray,
+    opacity: np.ndarray,
+    jacobian: np.ndarray,
+) -> None:
+    """Render, and fill jacobian (n, k, 6): channel_weights (k, 3) @ rgb by origin and unit direction.
+
+    Where the samples lie along the ray is held fixed.
+    """
+    size = rays.t.shape[0]
+    drgb = np.empty((size, 3), np.float32)
+    for start in range(first, last, size):
+        count = min(size, last - start)
+        rows, _ = forward(
+            net, dom, origins, directions, jitter, start, count, per_ray, stop_below, True, samples, rays
+        )
+        rows = compact(samples, rays, rows)
+        for r in range(count):
+            for c in range(3):
+                rgb[start + r, c] = shade(rays, r, c, background[c])
+            o = rays.opacity[r]
+            opacity[start + r] = o
+            depth[start + r] = rays.depth[r] / o if o > np.float32(1e-4) else np.float32(0)
+        for k in range(channel_weights.shape[0]):
+            for r in range(count):
+                for c in range(3):
+                    drgb[r, c] = channel_weights[k, c]
+                shade_backward(rays, r, background, drgb[r])
+            colour_backward(net, rays, count, drgb)
+            composite_backward(samples, rays, count, 0.0, dom.contracted)
+            if rows > 0:
+                density_backward(net, samples, rows)
+            ray_gradients(net, dom.contracted, directions, start, count, rows, samples, rays, jacobian, k)

@@ -1,0 +1,128 @@
+"""Forward pass of a packet of rays: encode, density network, compositing, colour network."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from stages.nerf.kernels.encoding import encode
+from stages.nerf.kernels.march import advance, begin
+from stages.nerf.kernels.types import FASTMATH, SH_SIZE, Domain, Net, Rays, Samples
+
+MAX_EXPONENT = np.float32(11.0)
+
+
+@njit(nogil=True, fastmath=FASTMATH)
+def relu(a: np.ndarray) -> None:
+    for i in range(a.shape[0]):
+        for j in range(a.shape[1]):
+            a[i, j] = max(a[i, j], np.float32(0))
+
+
+@njit(nogil=True, fastmath=FASTMATH)
+def density_network(net: Net, samples: Samples, first: int, last: int) -> None:
+    """Fill x, h and out of rows first..last."""
+    encode(net, samples.u, first, last, samples.x)
+    h = samples.h[first:last]
+    np.dot(samples.x[first:last], net.w1, h)
+    relu(h)
+    np.dot(h, net.w2, samples.out[first:last])
+
+
+@njit(inline="always")
+def density(raw: float) -> float:
+    return math.exp(min(raw, MAX_EXPONENT))
+
+
+@njit(nogil=True, fastmath=FASTMATH)
+def composite(samples: Samples, first: int, last: int, stop_below: float, rays: Rays) -> None:
+    """Accumulate rows first..last into their rays, and end the rays whose transmittance falls below the limit."""
+    features = samples.out.shape[1] - 1
+    for s in range(first, last):
+        r = samples.ray[s]
+        before = rays.trans[r]
+        if before < stop_below:
+            samples.weight[s] = 0
+            samples.trans[s] = before
+            continue
+        after = before * math.exp(-density(samples.out[s, 0]) * samples.dt[s])
+        weight = before - after
+        samples.weight[s], samples.trans[s], rays.trans[r] = weight, after, after
+        rays.opacity[r] += weight
+        rays.depth[r] += weight * samples.t[s]
+        for f in range(features):
+            rays.feats[r, f] += weight * samples.out[s, 1 + f]
+        if after < stop_below:
+            rays.alive[r] = False
+
+
+@njit(nogil=True, fastmath=FASTMATH)
+def harmonics(d: np.ndarray, out: np.ndarray, at: int) -> None:
+    """Real spherical harmonics of degree 0 to 3 of the unit direction d, written to out[at:at + 16]."""
+    x, y, z = d[0], d[1], d[2]
+    xx, yy, zz = x * x, y * y, z * z
+    values = (
+        0.28209479, -0.48860251 * y, 0.48860251 * z, -0.48860251 * x,
+        1.09254843 * x * y, -1.09254843 * y * z, 0.31539157 * (3 * zz - 1), -1.09254843 * x * z,
+        0.54627422 * (xx - yy), 0.59004359 * y * (yy - 3 * xx), 2.89061144 * x * y * z,
+        0.45704580 * y * (1 - 5 * zz), 0.37317633 * z * (5 * zz - 3), 0.45704580 * x * (1 - 5 * zz),
+        1.44530572 * z * (xx - yy), 0.59004359 * x * (3 * yy - xx),
+    )  # fmt: skip
+    for i in range(16):
+        out[at + i] = values[i]
+
+
+@njit(nogil=True, fastmath=FASTMATH)
+def colour_network(net: Net, directions: np.ndarray, first: int, count: int, rays: Rays) -> None:
+    """Fill the view-dependent part of the colour, rays.rgb, from the composited features."""
+    features = rays.feats.shape[1] - SH_SIZE
+    for r in range(count):
+        harmonics(directions[first + r], rays.feats[r], features)
+    h1, h2 = rays.h1[:count], rays.h2[:count]
+    np.dot(rays.feats[:count], net.c1, h1)
+    relu(h1)
+    np.dot(h1, net.c2, h2)
+    relu(h2)
+    np.dot(h2, net.c3, rays.rgb[:count])
+
+
+@njit(inline="always")
+def shade(rays: Rays, r: int, channel: int, background: float) -> float:
+    """Colour of a ray: 0.5 and the features' own colour, the view-dependent part, the background behind."""
+    o = rays.opacity[r]
+    return rays.feats[r, channel] + o * (rays.rgb[r, channel] + np.float32(0.5)) + (np.float32(1) - o) * background
+
+
+@njit(nogil=True, fastmath=FASTMATH)
+def forward(
+    net: Net,
+    dom: Domain,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    jitter: np.ndarray,
+    first: int,
+    count: int,
+    per_ray: int,
+    stop_below: float,
+    keep: bool,
+    samples: Samples,
+    rays: Rays,
+) -> tuple[int, int]:
+    """Trace rays first..first+count (unit directions); return the rows kept and the samples evaluated.
+
+    With `keep` the rows of all rounds stay, for the backward pass; without, each round reuses them.
+    """
+    begin(dom, origins, directions, jitter, first, count, rays)
+    row, evaluated = 0, 0
+    while True:
+        start = row if keep else 0
+        row = advance(dom, origins, directions, first, count, per_ray, start, rays, samples)
+        if row == start:
+            break
+        density_network(net, samples, start, row)
+        composite(samples, start, row, stop_below, rays)
+        evaluated += row - start
+    colour_network(net, directions, first, count, rays)
+    return row, evaluated

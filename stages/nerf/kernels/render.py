@@ -1,0 +1,45 @@
+"""Render rays: colour, depth and opacity."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from stages.nerf.kernels.packet import forward, shade
+from stages.nerf.kernels.types import FASTMATH, Domain, Net, Rays, Samples
+
+
+@njit(nogil=True, fastmath=FASTMATH, cache=True)
+def render(
+    net: Net,
+    dom: Domain,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    jitter: np.ndarray,
+    background: np.ndarray,
+    first: int,
+    last: int,
+    per_ray: int,
+    stop_below: float,
+    samples: Samples,
+    rays: Rays,
+    rgb: np.ndarray,
+    depth: np.ndarray,
+    opacity: np.ndarray,
+) -> int:
+    """Fill rgb, depth (distance along the unit direction, 0 where nothing) and opacity; return the samples used."""
+    size = rays.t.shape[0]
+    total = 0
+    for start in range(first, last, size):
+        count = min(size, last - start)
+        _, evaluated = forward(
+            net, dom, origins, directions, jitter, start, count, per_ray, stop_below, False, samples, rays
+        )
+        total += evaluated
+        for r in range(count):
+            for c in range(3):
+                rgb[start + r, c] = shade(rays, r, c, background[c])
+            o = rays.opacity[r]
+            opacity[start + r] = o
+            depth[start + r] = rays.depth[r] / o if o > np.float32(1e-4) else np.float32(0)
+    return total

@@ -1,0 +1,80 @@
+"""Arrays that the kernels share, as named tuples that numba passes without copying."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+"""What the compiler may assume; NaN and infinity keep their meaning."""
+
+SH_SIZE = 16
+
+
+class Net(NamedTuple):
+    """Learnt parameters (float32) and the layout of the hash grid (int64, one entry a level)."""
+
+    table: np.ndarray  # (entries, level_features)
+    w1: np.ndarray  # (levels * level_features, hidden)
+    w2: np.ndarray  # (hidden, 1 + features)
+    c1: np.ndarray  # (features + SH_SIZE, colour_hidden)
+    c2: np.ndarray  # (colour_hidden, colour_hidden)
+    c3: np.ndarray  # (colour_hidden, 3)
+    offsets: np.ndarray
+    resolutions: np.ndarray
+    masks: np.ndarray  # table size - 1 of a hashed level, -1 of a dense one
+
+
+class Domain(NamedTuple):
+    """Where the field lives, in normalised coordinates, and what of it is occupied."""
+
+    contracted: bool
+    half: np.ndarray  # (3,) half extents of the box that rays are clipped to, where not contracted
+    step: float  # step length, before the growth with distance of contracted space
+    near: float
+    far: float
+    bits: np.ndarray  # occupancy, one bit a cell, x fastest
+    coarse: np.ndarray  # one byte for each block of 8 x 8 x 8 cells
+    resolution: int
+
+
+class Samples(NamedTuple):
+    """Everything about the samples of a packet of rays; rows are in order of evaluation."""
+
+    y: np.ndarray  # (n, 3) position, normalised coordinates
+    u: np.ndarray  # (n, 3) position in the unit cube of the grid
+    t: np.ndarray  # (n,) distance along the ray
+    dt: np.ndarray  # (n,)
+    ray: np.ndarray  # (n,) index in the packet
+    previous: np.ndarray  # (n,) row of the same ray's previous sample, -1 for its first
+    x: np.ndarray  # (n, levels * level_features) encoding
+    h: np.ndarray  # (n, hidden) after the activation
+    out: np.ndarray  # (n, 1 + features) network output
+    weight: np.ndarray  # (n,) compositing weight
+    trans: np.ndarray  # (n,) transmittance after the sample
+    dx: np.ndarray  # (n, levels * level_features) gradients, same shapes
+    dh: np.ndarray
+    dout: np.ndarray
+
+
+class Rays(NamedTuple):
+    """State of the rays of a packet."""
+
+    t: np.ndarray
+    far: np.ndarray
+    trans: np.ndarray
+    last: np.ndarray  # row of the ray's newest sample, -1 without
+    alive: np.ndarray
+    feats: np.ndarray  # (r, features + SH_SIZE) composited features, then the direction's harmonics
+    opacity: np.ndarray
+    depth: np.ndarray
+    h1: np.ndarray
+    h2: np.ndarray
+    rgb: np.ndarray  # (r, 3) view-dependent part
+    dfeats: np.ndarray
+    dh1: np.ndarray
+    dh2: np.ndarray
+    drgb: np.ndarray
+    dopacity: np.ndarray
+    ddepth: np.ndarray

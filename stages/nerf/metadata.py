@@ -1,0 +1,58 @@
+"""What a field file says about itself, besides its arrays."""
+
+from __future__ import annotations
+
+import msgspec
+
+from stages.nerf.config import FieldConfig
+
+FORMAT_VERSION = 1
+
+
+class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """From object coordinates to the field's: y = (x - centre) / scale.
+
+    A bounded field fills the box |y| <= half; a contracted one all space, the unit ball at full resolution.
+    `near`, `far` and `step` are lengths in y.
+    """
+
+    contracted: bool
+    centre: tuple[float, float, float]
+    scale: float
+    half: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    near: float = 0.0
+    far: float = 8.0
+    step: float = 2.0 / 384
+
+
+class TrainingCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A training view: its name, intrinsics at the size trained on, and pose (row-major 4x4, OpenCV axes)."""
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float]
+    cam_from_object: tuple[float, ...]
+
+
+class FieldMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Stored as JSON beside the arrays of a field."""
+
+    space: Space
+    config: FieldConfig
+    background: tuple[float, float, float]
+    cameras: list[TrainingCamera]
+    dataset_kind: str
+    dataset_sha256: str
+    unit: str = "dataset unit"
+    metres_per_unit: float | None = None
+    has_background: bool = True
+    psnr_db: float | None = None
+    trained_seconds: float = 0.0
+    trained_steps: int = 0
+    made_by: str = ""
+    version: int = FORMAT_VERSION

@@ -1,0 +1,89 @@
+"""Which cells of the unit cube hold something: bits for marching, estimates of the density for training."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.geometry.cameras import Camera
+from stages.nerf.kernels.density import densities
+from stages.nerf.kernels.types import Net
+from stages.nerf.metadata import Space
+from stages.nerf.workers import Workers
+
+BLOCK = 8
+
+
+def pack(occupied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bits (one a cell, x fastest) and one byte a block of 8x8x8 cells, of an (n, n, n) bool grid [z, y, x]."""
+    n = occupied.shape[0]
+    m = n // BLOCK
+    blocks = occupied.reshape(m, BLOCK, m, BLOCK, m, BLOCK).any(axis=(1, 3, 5))
+    return np.packbits(occupied.ravel(), bitorder="little"), blocks.ravel().astype(np.uint8)
+
+
+def cell_positions(cells: np.ndarray, n: int, inside: np.ndarray) -> np.ndarray:
+    """Points (k, 3) float32 of the unit cube in flat cells (k,), at `inside` (k, 3) in 0..1 of the cell."""
+    index = np.stack([cells % n, cells // n % n, cells // (n * n)], axis=1)
+    return ((index + inside) / n).astype(np.float32)
+
+
+def from_cube(space: Space, u: np.ndarray) -> np.ndarray:
+    """Object coordinates (k, 3) of points of the unit cube; NaN outside a contracted space's ball of radius 2."""
+    if not space.contracted:
+        y = 2 * u.astype(np.float64) - 1
+    else:
+        z = (u.astype(np.float64) - 0.5) * 4
+        norm = np.linalg.norm(z, axis=1, keepdims=True)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            radius = np.where(norm <= 1, norm, np.where(norm < 2, 1 / (2 - norm), np.nan))
+            y = np.where(norm > 0, z * (radius / norm), 0.0)
+    return y * space.scale + np.array(space.centre)
+
+
+def seen_by_cameras(space: Space, n: int, cameras: list[tuple[Camera, np.ndarray]], least: int = 1) -> np.ndarray:
+    """(n, n, n) bool: cells whose centre at least `least` (camera, cam_from_object) see, in front of them."""
+    cells = np.arange(n**3)
+    points = from_cube(space, cell_positions(cells, n, np.full((1, 3), 0.5)))
+    count = np.zeros(n**3, np.int32)
+    margin = 1.03
+    for camera, cam_from_object in cameras:
+        in_cam = points @ cam_from_object[:3, :3].T + cam_from_object[:3, 3]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            x = np.abs(in_cam[:, 0] / in_cam[:, 2] * camera.fx + camera.cx - (camera.width - 1) / 2)
+            y = np.abs(in_cam[:, 1] / in_cam[:, 2] * camera.fy + camera.cy - (camera.height - 1) / 2)
+            count += (in_cam[:, 2] > 0) & (x <= margin * camera.width / 2) & (y <= margin * camera.height / 2)
+    return (count >= least).reshape(n, n, n)
+
+
+class OccupancyEstimate:
+    """A running maximum of the density in every cell (Instant-NGP's update), for training."""
+
+    def __init__(self, space: Space, n: int, allowed: np.ndarray, rng: np.random.Generator):
+        self.space, self.n, self.rng = space, n, rng
+        self.allowed = allowed.ravel()
+        self.candidates = np.flatnonzero(self.allowed)
+        self.estimate = np.zeros(n**3, np.float32)
+        self.occupied = allowed.copy()
+        self._scratch_u = np.empty((0, 3), np.float32)
+
+    def update(self, net: Net, workers: Workers, fraction: float, decay: float = 0.95, least: float = 0.01) -> None:
+        """Look at a random `fraction` of the cells and at as many of the occupied ones; then threshold anew.
+
+        A cell is occupied where a step through it has an opacity of at least `least`, or more than the mean has.
+        """
+        count = max(1, int(len(self.candidates) * fraction))
+        cells = self.rng.choice(self.candidates, count, replace=False) if fraction < 1 else self.candidates
+        occupied = np.flatnonzero(self.occupied.ravel())
+        if fraction < 1 and len(occupied):
+            cells = np.concatenate([cells, self.rng.choice(occupied, min(count, len(occupied)), replace=False)])
+        u = cell_positions(cells, self.n, self.rng.random((len(cells), 3), dtype=np.float32))
+        found = np.empty(len(cells), np.float32)
+        workers.each(len(cells), 4096, lambda scratch, a, b: densities(net, u, a, b, scratch.samples, found))
+        if fraction < 1:
+            self.estimate *= decay
+        else:
+            self.estimate *= decay
+        np.maximum.at(self.estimate, cells, found)
+        opacity = self.estimate * self.space.step
+        limit = min(least, float(opacity[self.candidates].mean()))
+        self.occupied = ((opacity > limit) & self.allowed).reshape(self.n, self.n, self.n)

@@ -1,0 +1,47 @@
+"""Adam over all parameters of a field, with the gradients of every thread."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stages.nerf.field import LEARNT
+from stages.nerf.kernels.adam import adam_step
+from stages.nerf.kernels.train import Gradients
+from stages.nerf.kernels.types import Net
+from stages.nerf.workers import Workers
+
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
+"""Instant-NGP's settings."""
+
+
+class Optimiser:
+    """Owns the moments and one set of gradients a thread."""
+
+    def __init__(self, net: Net, threads: int):
+        self.net = net
+        shapes = {name: getattr(net, name).shape for name in LEARNT}
+        self.gradients = [
+            Gradients(**{n: np.zeros(s, np.float32) for n, s in shapes.items()}) for _ in range(threads)
+        ]
+        self._moments = {
+            n: (np.zeros(math.prod(s), np.float32), np.zeros(math.prod(s), np.float32)) for n, s in shapes.items()
+        }
+        self.steps = 0
+
+    def step(self, rate: float, workers: Workers) -> None:
+        """Update the parameters in place and clear the gradients."""
+        self.steps += 1
+        corrected = rate * math.sqrt(1 - BETA2**self.steps) / (1 - BETA1**self.steps)
+        for name in LEARNT:
+            parameter = getattr(self.net, name).reshape(-1)
+            gradients = tuple(getattr(g, name).reshape(-1) for g in self.gradients)
+            mean, square = self._moments[name]
+            sparse = name == "table"
+
+            def update(_: object, first: int, last: int, args: tuple = (parameter, gradients, mean, square, sparse)):  # noqa: B023
+                p, g, m, v, skip = args
+                adam_step(p, g, m, v, first, last, corrected, BETA1, BETA2, EPSILON, skip)
+
+            workers.each(len(parameter), 1 << 18, update)

@@ -1,0 +1,116 @@
+"""Render a field on the CPU with the compiled kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stages.geometry.cameras import Camera, rays
+from stages.nerf.field import Field
+from stages.nerf.kernels.jacobian import render_jacobian
+from stages.nerf.kernels.render import render
+from stages.nerf.metadata import FieldMetadata
+from stages.nerf.rendering_api import RenderedRays, RenderedView
+from stages.nerf.workers import Workers
+
+PACKET = 64
+PER_RAY = 4
+STOP_BELOW = 5e-3
+JACOBIAN_STOP_BELOW = 1e-3
+CHUNK = 1024
+JACOBIAN_ROWS = 8192
+TILE = 8
+
+
+class NumbaRenderer:
+    """Implements RayRenderer; safe to call from one thread at a time."""
+
+    def __init__(self, field: Field, threads: int = 1, stop_below: float = STOP_BELOW):
+        self.metadata: FieldMetadata = field.metadata
+        self.stop_below = stop_below
+        self.samples_evaluated = 0
+        self._net, self._domain = field.net, field.domain()
+        self._background = np.array(field.metadata.background, np.float32)
+        self._workers = Workers(field.metadata.config, threads, PACKET, PACKET * PER_RAY, backward=False)
+        self._jacobian_workers: Workers | None = None
+
+    def normalised(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Origins and unit directions in the field's coordinates, and the length of the directions there (n,)."""
+        space = self.metadata.space
+        o = ((np.asarray(origins, np.float64) - space.centre) / space.scale).astype(np.float32)
+        d = np.asarray(directions, np.float64) / space.scale
+        length = np.linalg.norm(d, axis=1, keepdims=True)
+        return o, (d / length).astype(np.float32), length[:, 0].astype(np.float32)
+
+    def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
+        """See RayRenderer."""
+        o, d, length = self.normalised(origins, directions)
+        n = len(o)
+        rgb, depth, opacity = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+        jitter = np.full(n, 0.5, np.float32)
+        evaluated = self._workers.each(
+            n,
+            CHUNK,
+            lambda s, a, b: render(
+                self._net, self._domain, o, d, jitter, self._background, a, b,
+                PER_RAY, self.stop_below, s.samples, s.rays, rgb, depth, opacity,
+            ),
+        )  # fmt: skip
+        self.samples_evaluated += sum(evaluated)  # type: ignore[arg-type]
+        return RenderedRays(np.clip(rgb, 0, 1), depth / length, opacity)
+
+    def render_rays_jacobian(
+        self, origins: np.ndarray, directions: np.ndarray, channel_weights: np.ndarray
+    ) -> tuple[RenderedRays, np.ndarray]:
+        """See RayRenderer. The colours are not clipped, so that they fit their derivative."""
+        if self._jacobian_workers is None:
+            self._jacobian_workers = Workers(
+                self.metadata.config, self._workers.threads, PACKET // 2, JACOBIAN_ROWS, backward=True
+            )
+        o, d, length = self.normalised(origins, directions)
+        n, k = len(o), len(channel_weights)
+        rgb, depth, opacity = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
+        jacobian = np.zeros((n, k, 6), np.float32)
+        jitter = np.full(n, 0.5, np.float32)
+        weights = np.ascontiguousarray(channel_weights, np.float32)
+        self._jacobian_workers.each(
+            n,
+            PACKET // 2,
+            lambda s, a, b: render_jacobian(
+                self._net, self._domain, o, d, jitter, self._background, weights, a, b,
+                PER_RAY, JACOBIAN_STOP_BELOW, s.samples, s.rays, rgb, depth, opacity, jacobian,
+            ),
+        )  # fmt: skip
+        return RenderedRays(rgb, depth / length, opacity), self._by_object_rays(jacobian, d, length)
+
+    def _by_object_rays(self, jacobian: np.ndarray, unit: np.ndarray, length: np.ndarray) -> np.ndarray:
+        """From normalised origin and unit direction to the caller's origin and direction."""
+        scale = np.float32(self.metadata.space.scale)
+        by_unit = jacobian[..., 3:]
+        along = np.sum(by_unit * unit[:, None], axis=-1, keepdims=True)
+        by_direction = (by_unit - along * unit[:, None]) / (length[:, None, None] * scale)
+        return np.concatenate([jacobian[..., :3] / scale, by_direction], axis=-1)
+
+    def render_view(self, camera: Camera, cam_from_object: np.ndarray) -> RenderedView:
+        """See RayRenderer. Rays are traced tile by tile, so that a packet's rays read the same table entries."""
+        order = tile_order(camera.width, camera.height)
+        origins, directions = rays(camera, cam_from_object, camera.grid()[order])
+        traced = self.render_rays(origins, directions)
+        shape = (camera.height, camera.width)
+        rgb, depth, opacity = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.float32)
+        rgb.reshape(-1, 3)[order] = (traced.rgb * 255 + 0.5).astype(np.uint8)
+        depth.reshape(-1)[order] = traced.depth
+        opacity.reshape(-1)[order] = traced.opacity
+        return RenderedView(rgb, depth, opacity, camera, cam_from_object)
+
+    def close(self) -> None:
+        """End the threads."""
+        self._workers.close()
+        if self._jacobian_workers is not None:
+            self._jacobian_workers.close()
+
+
+def tile_order(width: int, height: int, tile: int = TILE) -> np.ndarray:
+    """Row-major pixel indices in the order of square tiles."""
+    y, x = np.divmod(np.arange(width * height), width)
+    key = ((y // tile) * (-(-width // tile)) + x // tile) * tile * tile + (y % tile) * tile + x % tile
+    return np.argsort(key, kind="stable")

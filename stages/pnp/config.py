@@ -1,0 +1,27 @@
+"""Settings of the PnP stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PnpConfig:
+    """When a pose counts as found, and how hard it is looked for."""
+
+    threshold_px: float = 3.0
+    """largest reprojection error of an inlier where the image is 400 pixels long; it grows with the image"""
+    iterations: int = 4000
+    """at most so many samples of three points"""
+    confidence: float = 0.999
+    """RANSAC stops when a better pose would have been seen with this probability"""
+    min_inliers: int = 8
+    """fewer inliers are no pose"""
+    min_inlier_ratio: float = 0.08
+    """a smaller share of inliers is no pose: that many agree by chance"""
+    min_spread: float = 0.01
+    """inliers must extend at least this share of the image's longer side across their narrowest direction (std)"""
+    max_rotation_std_deg: float = 5.0
+    """a pose that its inliers leave less certain than this is none"""
+    seed: int = 0
+    """of RANSAC's samples"""

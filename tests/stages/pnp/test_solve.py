@@ -1,0 +1,150 @@
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from bus.messages import Reason
+from stages.geometry import Camera, exp_se3, inverse, log_se3, look_at, rotation_error_deg, translation_error
+from stages.pnp.core import PnpConfig, PnpResult, solve
+from stages.pnp.least_squares import reprojection
+
+Maker = Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]
+CAMERA = Camera(400, 300, 420.0, 430.0, 201.0, 147.0)
+LENS = Camera(400, 300, 420.0, 430.0, 201.0, 147.0, (-0.12, 0.03, 0.001, -0.0015, 0.0))
+POSE = look_at((2.5, -2.0, 1.8), (0.0, 0.1, 0.0), (0.0, 0.0, 1.0))
+
+
+def problem(
+    rng: np.random.Generator, count: int = 120, wrong: float = 0.0, noise_px: float = 0.0, camera: Camera = CAMERA
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels, points and which of them belong together."""
+    points = rng.uniform(-0.8, 0.8, (count, 3))
+    pixels = camera.project(points @ POSE[:3, :3].T + POSE[:3, 3]) + rng.normal(0, noise_px, (count, 2))
+    right = np.arange(count) >= wrong * count
+    pixels[~right] = rng.uniform(0, (camera.width, camera.height), (int((~right).sum()), 2))
+    return pixels.astype(np.float32), points.astype(np.float32), right
+
+
+def solved(result: PnpResult) -> np.ndarray:
+    assert result.ok
+    assert result.cam_from_object is not None
+    return result.cam_from_object
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_exact_correspondences_give_the_pose_through_a_distorting_lens(seed: int) -> None:
+    pixels, points, _ = problem(np.random.default_rng(seed), 30, camera=LENS)
+    pose = solved(solve(pixels, points, LENS))
+    assert rotation_error_deg(pose, POSE) < 1e-3
+    assert translation_error(pose, POSE) < 1e-4
+
+
+@pytest.mark.parametrize(("count", "wrong"), [(60, 0.5), (300, 0.75), (600, 0.88)])
+def test_wrong_matches_are_found_out(count: int, wrong: float) -> None:
+    pixels, points, right = problem(np.random.default_rng(3), count, wrong, 0.7)
+    result = solve(pixels, points, CAMERA)
+    assert rotation_error_deg(solved(result), POSE) < 0.5
+    assert (result.inliers & right).sum() > 0.95 * right.sum()
+    assert (result.inliers & ~right).sum() <= max(2, 0.02 * count)
+    assert result.residual_px is not None
+    assert 0.5 < result.residual_px < 1.5
+
+
+def test_the_same_input_gives_the_same_result() -> None:
+    pixels, points, _ = problem(np.random.default_rng(4), 200, 0.6, 1.0)
+    first, second = solve(pixels, points, CAMERA), solve(pixels, points, CAMERA)
+    assert np.array_equal(solved(first), solved(second))
+    assert np.array_equal(first.inliers, second.inliers)
+
+
+@pytest.mark.parametrize("noise_px", [0.3, 1.2])
+def test_the_covariance_is_that_of_the_error(noise_px: float) -> None:
+    """xi^T C^-1 xi is chi-square with 6 degrees of freedom; the mean of 150 lies within 0.6 of 6 by 2 sigma."""
+    distances = []
+    for seed in range(150):
+        pixels, points, _ = problem(np.random.default_rng(seed), 80, 0.0, noise_px)
+        result = solve(pixels, points, CAMERA, PnpConfig(threshold_px=20.0))
+        twist = log_se3(solved(result) @ inverse(POSE))
+        assert result.covariance is not None
+        distances.append(twist @ np.linalg.solve(result.covariance, twist))
+    assert 5.2 < np.mean(distances) < 7.0
+    assert stats.kstest(distances, stats.chi2(6).cdf).pvalue > 0.01
+
+
+def test_weights_tell_precise_matches_from_coarse_ones() -> None:
+    errors = {"weighted": [], "equal": []}
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        pixels, points, _ = problem(rng, 100)
+        sigma = np.where(np.arange(100) % 2, 0.1, 1.5)
+        pixels = pixels + (rng.normal(size=(100, 2)) * sigma[:, None]).astype(np.float32)
+        config = PnpConfig(threshold_px=8.0)
+        for name, weights in (("weighted", (1 / sigma**2)), ("equal", None)):
+            pose = solved(solve(pixels, points, CAMERA, config, weights))
+            errors[name].append(translation_error(pose, POSE))
+    assert np.mean(errors["weighted"]) < 0.5 * np.mean(errors["equal"])
+
+
+def test_the_threshold_grows_with_the_image() -> None:
+    pixels, points, _ = problem(np.random.default_rng(5), 200, 0.3, 0.8)
+    large = CAMERA.resized(4 * CAMERA.width, 4 * CAMERA.height)
+    small_result = solve(pixels, points, CAMERA)
+    large_result = solve((pixels + 0.5) * 4 - 0.5, points, large)
+    assert abs(int(small_result.inliers.sum()) - int(large_result.inliers.sum())) <= 3
+
+
+def random_pixels(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    return problem(rng, 200, 1.0)[:2]
+
+
+def too_few(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    return problem(rng, 5)[:2]
+
+
+def all_in_one_spot(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    pixels, points, _ = problem(rng, 40, 0.0, 0.2)
+    near = np.linalg.norm(pixels - pixels[0], axis=1).argsort()[:10]
+    points = points[near[0]] + rng.normal(0, 1e-3, (40, 3))
+    pixels = CAMERA.project(points @ POSE[:3, :3].T + POSE[:3, 3]) + rng.normal(0, 0.3, (40, 2))
+    return pixels.astype(np.float32), points.astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("make", "reasons"),
+    [
+        (random_pixels, {Reason.NO_CONSENSUS, Reason.IMPLAUSIBLE_POSE}),
+        (too_few, {Reason.TOO_FEW_CONSISTENT_POINTS}),
+        (all_in_one_spot, {Reason.IMPLAUSIBLE_POSE, Reason.NO_CONSENSUS}),
+    ],
+)
+def test_what_holds_no_pose_is_said_to_hold_none(make: Maker, reasons: set[Reason]) -> None:
+    pixels, points = make(np.random.default_rng(6))
+    result = solve(pixels, points, CAMERA)
+    assert not result.ok
+    assert Reason(result.reason) in reasons
+    assert result.cam_from_object is None
+    assert result.covariance is None
+    assert result.inliers.shape == (len(pixels),)
+    assert not result.inliers.any()
+
+
+def test_points_behind_the_camera_are_no_inliers() -> None:
+    pixels, points, _ = problem(np.random.default_rng(7), 60)
+    centre = inverse(POSE)[:3, 3]
+    mirrored = np.concatenate([points, 2 * centre - points[:20]]).astype(np.float32)
+    result = solve(np.concatenate([pixels, pixels[:20]]), mirrored, CAMERA)
+    assert rotation_error_deg(solved(result), POSE) < 0.01
+    assert not result.inliers[60:].any()
+
+
+def test_the_derivative_is_by_the_left_twist() -> None:
+    pixels, points, _ = problem(np.random.default_rng(8), 20)
+    _, jacobian = reprojection(pixels, points, CAMERA, POSE)
+    for axis, step in enumerate(1e-6 * np.eye(6)):
+        ahead, _ = reprojection(pixels, points, CAMERA, exp_se3(step) @ POSE)
+        behind, _ = reprojection(pixels, points, CAMERA, exp_se3(-step) @ POSE)
+        np.testing.assert_allclose(jacobian[:, :, axis], (ahead - behind) / 2e-6, rtol=1e-4, atol=1e-3)

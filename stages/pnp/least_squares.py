@@ -9,7 +9,7 @@ import numpy as np
 from stages.geometry import Camera, exp_se3
 
 _MAX_STEPS = 20
-_CONVERGED = 1e-8
+_CONVERGED = 1e-6
 _HUBER = 1.345
 _MEDIAN_TO_SIGMA = 1.1774
 """The median length of a 2-D Gaussian of unit sigma is this; Huber's constant is for a known sigma."""
@@ -54,21 +54,23 @@ def reprojection(
     """Residuals (n, 2) in pixels and their derivative (n, 2, 6) by the left twist; infinite behind the camera."""
     in_cam = points @ cam_from_object[:3, :3].T + cam_from_object[:3, 3]
     x, y, z = in_cam.T
-    inverse = 1 / np.where(z > 1e-9, z, np.nan)
+    inverse = 1 / np.where(z > 1e-9, z, 1e-9)
     u, v = x * inverse, y * inverse
-    predicted = np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], axis=1)
-    jacobian = np.empty((len(points), 2, 6))
     zero = np.zeros_like(u)
-    jacobian[:, 0] = camera.fx * np.stack([inverse, zero, -u * inverse, -u * v, 1 + u * u, -v], axis=1)
-    jacobian[:, 1] = camera.fy * np.stack([zero, inverse, -v * inverse, -1 - v * v, u * v, u], axis=1)
-    return np.nan_to_num(predicted - pixels, nan=np.inf), jacobian
+    jacobian = np.empty((len(points), 2, 6))
+    jacobian[:, 0] = np.stack([inverse, zero, -u * inverse, -u * v, 1 + u * u, -v], axis=1)
+    jacobian[:, 1] = np.stack([zero, inverse, -v * inverse, -1 - v * v, u * v, u], axis=1)
+    jacobian *= np.array([camera.fx, camera.fy])[:, None]
+    residuals = np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], axis=1) - pixels
+    residuals[z <= 0] = np.inf
+    return residuals, jacobian
 
 
 def _step(residuals: np.ndarray, jacobian: np.ndarray, weights: np.ndarray, damping: float) -> np.ndarray:
-    hessian = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian, optimize=True)
-    gradient = np.einsum("n,nij,ni->j", weights, jacobian, residuals, optimize=True)
+    weighted = (weights[:, None, None] * jacobian).reshape(-1, 6)
+    hessian = weighted.T @ jacobian.reshape(-1, 6)
     hessian[np.diag_indices(6)] *= 1 + damping
-    return -np.linalg.solve(hessian + 1e-12 * np.eye(6), gradient)
+    return -np.linalg.solve(hessian + 1e-12 * np.eye(6), weighted.T @ residuals.ravel())
 
 
 def _lengths(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -95,5 +97,5 @@ def _covariance(residuals: np.ndarray, jacobian: np.ndarray, weights: np.ndarray
     pull = np.minimum(length, delta)
     freedom = max(2 * len(length) - 6, 1)
     slope = np.where(length <= delta, 1.0, delta / (2 * np.maximum(length, 1e-12))).mean()
-    hessian = np.einsum("n,nij,nik->jk", weights, jacobian, jacobian, optimize=True)
+    hessian = (weights[:, None, None] * jacobian).reshape(-1, 6).T @ jacobian.reshape(-1, 6)
     return (pull**2).sum() / freedom / slope**2 * np.linalg.pinv(hessian, hermitian=True)

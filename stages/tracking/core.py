@@ -117,12 +117,7 @@ class Tracker:
         """Give up what is past its deadline; call it often."""
         late = [a for a in self._in_flight.values() if now_ns - a.sent_ns > self.deadline_ms * _NS_PER_MS]
         reports: list[Output] = [self._give_up(attempt, now_ns) for attempt in late]
-        if self._waiting is not None and not self._full() and self._waited_too_long(now_ns):
-            frame, _ = self._waiting
-            self._waiting = None
-            self._dropped += 1
-            reports.append(self._report(frame, 0, self._policy.missed(frame)))
-        return [*self._admit(now_ns), *reports]
+        return [*self._admit(now_ns), *reports, *self._turn_away(now_ns)]
 
     def _admit(self, now_ns: int) -> list[Output]:
         if self._waiting is None or self._full():
@@ -141,8 +136,16 @@ class Tracker:
         again = self._waiting is not None and self._waiting[0].frame_id in self._in_flight
         return again or len(self._in_flight) >= self._config.depth
 
-    def _waited_too_long(self, now_ns: int) -> bool:
-        return self._waiting is not None and now_ns - self._waiting[1] > self._config.guess_wait_ms * _NS_PER_MS
+    def _turn_away(self, now_ns: int) -> list[Output]:
+        """Drop the waiting frame if it is only its guess that has been missing for too long."""
+        if self._waiting is None or self._full():
+            return []
+        frame, since_ns = self._waiting
+        if now_ns - since_ns <= self._config.guess_wait_ms * _NS_PER_MS:
+            return []
+        self._waiting = None
+        self._dropped += 1
+        return [self._report(frame, 0, self._policy.missed(frame))]
 
     def _give_up(self, attempt: Attempt, now_ns: int) -> StateReport:
         del self._in_flight[attempt.frame.frame_id]

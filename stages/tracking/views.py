@@ -30,7 +30,7 @@ class TrainingViews:
         return spread if spread > 1e-9 else 1.0
 
     def pose_of(self, name: str) -> np.ndarray:
-        """cam_from_object of the view of that name (see find_name). DatasetError or ConfigError if there is none."""
+        """cam_from_object of the view of that name, as find_name finds it. DatasetError or ConfigError if none."""
         if not self.names:
             raise ConfigError(f"the field does not tell its training views, so train:{name} means nothing")
         return self.cam_from_object[self.names.index(find_name(list(self.names), name))]

@@ -1,0 +1,189 @@
+"""The door: who is let in, what is counted, and when a place becomes free."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bus.messages import GuessReason, TrackingState
+from stages.errors import ConfigError
+from stages.tracking.config import MotionConfig, TrackingConfig
+from stages.tracking.core import GuessOrder, Output, StateReport, Tracker
+from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
+
+MS = 1_000_000
+
+
+class Anywhere:
+    """A policy that guesses the origin, and asks for `passes` passes over each frame."""
+
+    def __init__(self, passes: int = 1, known: bool = True) -> None:
+        self.passes = passes
+        self.known = known
+
+    def on_truth(self, frame_id: int, cam_from_object: np.ndarray | None) -> None:
+        self.known = True
+
+    def first_guess(self, frame: FrameInfo) -> PoseGuess | None:
+        return PoseGuess(GuessReason.PRIOR, np.eye(4)) if self.known else None
+
+    def next_guess(self, attempt: Attempt, result: PoseResult) -> PoseGuess | None:
+        return PoseGuess(GuessReason.NEXT_PASS, np.eye(4)) if attempt.passes < self.passes else None
+
+    def conclude(self, attempt: Attempt, result: PoseResult) -> Belief:
+        return Belief(TrackingState.TRACKING, 1.0, np.eye(4))
+
+    def missed(self, frame: FrameInfo) -> Belief:
+        return Belief(TrackingState.LOST, 0.0)
+
+
+def tracker(passes: int = 1, known: bool = True, **config: float) -> Tracker:
+    return Tracker(TrackingConfig(**config), Anywhere(passes, known))  # type: ignore[arg-type]
+
+
+def frame(frame_id: int) -> FrameInfo:
+    return FrameInfo(frame_id, frame_id * 33 * MS)
+
+
+def done(frame_id: int, pass_index: int = 0) -> PoseResult:
+    return PoseResult(frame_id, pass_index, True, np.eye(4))
+
+
+def guessed(outputs: list[Output]) -> list[tuple[int, int]]:
+    return [(o.frame.frame_id, o.pass_index) for o in outputs if isinstance(o, GuessOrder)]
+
+
+def reported(outputs: list[Output]) -> list[int]:
+    return [o.frame.frame_id for o in outputs if isinstance(o, StateReport)]
+
+
+def test_only_the_newest_frame_waits_and_it_enters_when_a_place_is_free() -> None:
+    door = tracker(depth=2)
+    entered = [guessed(door.on_frame(frame(i), 0)) for i in range(5)]
+    assert entered == [[(0, 0)], [(1, 0)], [], [], []]
+    assert door.counts.dropped_at_the_door == 2
+    outputs = door.on_pose(done(1), 10 * MS)
+    assert (guessed(outputs), reported(outputs)) == ([(4, 0)], [1])
+
+
+def test_frames_that_the_bus_let_go_count_as_dropped() -> None:
+    door = tracker()
+    door.on_frame(frame(0), 0)
+    door.on_frame(frame(7), 0, missed=6)
+    assert (door.counts.received, door.counts.dropped_at_the_door, door.counts.admitted) == (8, 6, 2)
+
+
+def test_a_result_past_its_deadline_frees_the_place_and_is_counted_lost() -> None:
+    door = tracker(depth=1, max_deadline_ms=1000)
+    door.on_frame(frame(0), 0)
+    door.on_frame(frame(1), 5 * MS)
+    assert door.on_tick(1000 * MS) == []
+    outputs = door.on_tick(1001 * MS)
+    assert (guessed(outputs), reported(outputs)) == ([(1, 0)], [0])
+    assert (door.counts.lost, door.counts.in_flight) == (1, 1)
+    assert door.on_pose(done(0), 1002 * MS) == []
+    assert (door.counts.late, door.counts.finished) == (1, 0)
+
+
+def test_the_deadline_follows_the_usual_latency_between_its_limits() -> None:
+    door = tracker(depth=1, min_deadline_ms=500, max_deadline_ms=8000, deadline_factor=10)
+    assert door.deadline_ms == 8000
+    for i in range(40):
+        door.on_frame(frame(i), i * MS)
+        door.on_pose(done(i), i * MS + 100 * MS)
+    assert door.deadline_ms == pytest.approx(1000)
+    for i in range(40, 80):
+        door.on_frame(frame(i), i * MS)
+        door.on_pose(done(i), i * MS + MS)
+    assert door.deadline_ms == 500
+
+
+def test_a_pipeline_that_becomes_slow_is_not_late_for_ever() -> None:
+    door = tracker(depth=1, min_deadline_ms=200, max_deadline_ms=10_000, deadline_factor=10)
+    now_ns = 0
+    for i, latency_ms in enumerate([20] * 20 + [3000] * 40):
+        door.on_frame(frame(i), now_ns)
+        for _ in range(latency_ms // 20):
+            now_ns += 20 * MS
+            door.on_tick(now_ns)
+        door.on_pose(done(i), now_ns)
+    assert 1 <= door.counts.lost < 10
+    assert door.counts.in_flight == 0
+
+
+def test_passes_keep_the_place_and_only_the_last_one_reports() -> None:
+    door = tracker(passes=3, depth=1)
+    assert guessed(door.on_frame(frame(0), 0)) == [(0, 0)]
+    door.on_frame(frame(1), 0)
+    first, second = door.on_pose(done(0, 0), MS), door.on_pose(done(0, 1), 2 * MS)
+    assert (guessed(first), guessed(second)) == ([(0, 1)], [(0, 2)])
+    assert reported(first) == reported(second) == []
+    assert door.on_pose(done(0, 1), 3 * MS) == []
+    last = door.on_pose(done(0, 2), 4 * MS)
+    assert (reported(last), guessed(last)) == ([0], [(1, 0)])
+    assert door.counts.finished == 1
+
+
+def test_a_frame_waits_for_its_guess_but_not_for_ever() -> None:
+    door = tracker(known=False, guess_wait_ms=500)
+    assert door.on_frame(frame(0), 0) == []
+    assert guessed(door.on_truth(0, np.eye(4), MS)) == [(0, 0)]
+    door = tracker(known=False, guess_wait_ms=500)
+    door.on_frame(frame(3), 0)
+    assert door.on_tick(500 * MS) == []
+    assert reported(door.on_tick(501 * MS)) == [3]
+    assert (door.counts.admitted, door.counts.dropped_at_the_door, door.counts.waiting) == (0, 1, 0)
+
+
+def test_a_camera_that_begins_again_does_not_take_over_a_frame_in_flight() -> None:
+    door = tracker(depth=2)
+    door.on_frame(frame(0), 0)
+    assert guessed(door.on_frame(frame(0), MS)) == []
+    assert guessed(door.on_pose(done(0), 2 * MS)) == [(0, 0)]
+
+
+ACTIONS = st.one_of(
+    st.tuples(st.just("frame"), st.integers(0, 3)),
+    st.tuples(st.just("pose"), st.integers(0, 12), st.integers(0, 2)),
+    st.tuples(st.just("wait"), st.integers(1, 900)),
+    st.tuples(st.just("truth")),
+)
+
+
+@given(st.lists(ACTIONS, max_size=60), st.integers(1, 4), st.integers(1, 3), st.booleans())
+def test_every_frame_is_accounted_for_whatever_happens(actions: list, depth: int, passes: int, known: bool) -> None:
+    door = tracker(passes, known, depth=depth, max_deadline_ms=1000, min_deadline_ms=300, guess_wait_ms=200)
+    now_ns = frames = received = 0
+    ended: list[int] = []
+    for action in actions:
+        match action:
+            case "frame", missed:
+                outputs = door.on_frame(frame(frames), now_ns, missed)
+                frames, received = frames + 1, received + 1 + missed
+            case "pose", frame_id, pass_index:
+                outputs = door.on_pose(done(frame_id, pass_index), now_ns)
+            case "wait", ms:
+                now_ns += ms * MS
+                outputs = door.on_tick(now_ns)
+            case _:
+                outputs = door.on_truth(0, np.eye(4), now_ns)
+        ended += reported(outputs)
+        counts = door.counts
+        assert counts.received == received
+        assert counts.received == counts.admitted + counts.dropped_at_the_door + counts.waiting
+        assert counts.admitted == counts.finished + counts.lost + counts.in_flight
+        assert 0 <= counts.in_flight <= depth
+        assert len(ended) == len(set(ended)) >= counts.finished + counts.lost
+
+
+@pytest.mark.parametrize("wrong", [{"depth": 0}, {"passes": 0}, {"retries": -1}, {"jump_deg": -1.0}])
+def test_settings_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        TrackingConfig(**wrong)  # type: ignore[arg-type]
+
+
+def test_settings_of_the_motion_model_are_checked_too() -> None:
+    with pytest.raises(ConfigError, match="window_ms"):
+        TrackingConfig(motion=MotionConfig(window_ms=-1))

@@ -1,0 +1,114 @@
+"""A world to track in: a camera's true path, training views around it, and a pipeline that takes its time."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bus.messages import GuessReason, TrackingState
+from stages.geometry import exp_se3, look_at, perturb, rotation_error_deg, translation_error
+from stages.tracking.core import GuessOrder, StateReport, Tracker
+from stages.tracking.distance import Limit
+from stages.tracking.policy import FrameInfo, PoseResult
+from stages.tracking.views import TrainingViews
+
+MS = 1_000_000
+FRAME_MS = 1000 / 30
+Path = Callable[[float], "np.ndarray | None"]
+
+
+def on_sphere(azimuth_deg: float, elevation_deg: float, radius: float = 4.0) -> np.ndarray:
+    """cam_from_object of a camera that looks at the origin."""
+    azimuth, elevation = np.deg2rad(azimuth_deg), np.deg2rad(elevation_deg)
+    eye = radius * np.array(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    return look_at(eye, (0, 0, 0), (0, 0, 1))
+
+
+def hand_held(seconds: float, speed: float = 1.0) -> np.ndarray:
+    """A hand that sways: up to about 35 degrees per second at speed 1."""
+    t = seconds * speed
+    shake = exp_se3([0.02 * np.sin(7 * t), 0.02 * np.cos(5 * t), 0, 0.01 * np.sin(9 * t), 0.01 * np.sin(11 * t), 0])
+    return shake @ on_sphere(30 * np.sin(t), 30 + 10 * np.sin(0.7 * t), 4 + 0.3 * np.sin(1.3 * t))
+
+
+@dataclass
+class World:
+    """Runs a Tracker against a simulated pipeline, in steps of 5 ms of its own clock.
+
+    The pipeline finds the pose if the guess is within its basin, with an error that grows with the guess's, and
+    otherwise fails or, one time in five, finds nonsense with few inliers. One pass takes `service_ms` in a pipeline
+    of which `latency_ms` is the whole length.
+    """
+
+    tracker: Tracker
+    path: Path
+    service_ms: float = 60.0
+    latency_ms: Callable[[np.random.Generator], float] = lambda rng: 150.0
+    loses: float = 0.0
+    seed: int = 0
+    distort: Callable[[int, PoseResult], PoseResult] = lambda frame_id, result: result
+    guesses: list[GuessOrder] = field(default_factory=list)
+    reports: list[StateReport] = field(default_factory=list)
+
+    def run(self, seconds: float) -> World:
+        rng = np.random.default_rng(self.seed)
+        pending: list[tuple[int, int, PoseResult]] = []
+        order, busy_until, frames = itertools.count(), 0, 0
+        for now_ns in range(0, int(seconds * 1e9), 5 * MS):
+            outputs = self.tracker.on_tick(now_ns)
+            if now_ns >= frames * FRAME_MS * MS:
+                outputs += self.tracker.on_frame(FrameInfo(frames, now_ns), now_ns)
+                frames += 1
+            while pending and pending[0][0] <= now_ns:
+                outputs += self.tracker.on_pose(heapq.heappop(pending)[2], now_ns)
+            self.reports += [output for output in outputs if isinstance(output, StateReport)]
+            for guess in (output for output in outputs if isinstance(output, GuessOrder)):
+                self.guesses.append(guess)
+                busy_until = max(busy_until, now_ns) + int(self.service_ms * MS)
+                done = max(busy_until, now_ns + int(self.latency_ms(rng) * MS))
+                if rng.random() >= self.loses:
+                    result = self.distort(guess.frame.frame_id, self._solve(guess, rng))
+                    heapq.heappush(pending, (done, next(order), result))
+        return self
+
+    def _solve(self, order: GuessOrder, rng: np.random.Generator) -> PoseResult:
+        truth, guess = self.path(order.frame.capture_ns * 1e-9), order.guess.cam_from_object
+        ids = order.frame.frame_id, order.pass_index
+        off = np.inf if truth is None else Limit(35.0, 2.5).of(truth, guess)
+        if off < 1.0 and truth is not None:
+            error = 0.005 * rng.standard_normal(6) * (0.3 + off)
+            covariance = np.diag([1e-4] * 3 + [1e-5] * 3)
+            return PoseResult(*ids, True, exp_se3(error) @ truth, covariance, int(150 * (1.2 - off)), 200, 1.0)
+        if rng.random() < 0.2:
+            return PoseResult(
+                *ids, True, perturb(guess, rng, (20, 90), 1.0), None, int(rng.integers(6, 15)), 120, 3.0
+            )
+        return PoseResult(*ids, False)
+
+    def states(self, since_s: float = 0.0, until_s: float = 1e9) -> list[TrackingState]:
+        return [r.belief.state for r in self.between(since_s, until_s)]
+
+    def between(self, since_s: float, until_s: float = 1e9) -> list[StateReport]:
+        return [r for r in self.reports if since_s <= r.frame.capture_ns * 1e-9 < until_s]
+
+    def worst_error(self, reports: list[StateReport]) -> tuple[float, float]:
+        """Largest rotation (degrees) and translation error of the poses that were measured."""
+        pairs = [
+            (self.path(r.frame.capture_ns * 1e-9), r.belief.cam_from_object) for r in reports if r.belief.score > 0
+        ]
+        return max(rotation_error_deg(a, b) for a, b in pairs), max(translation_error(a, b) for a, b in pairs)
+
+    def first_reasons(self) -> list[GuessReason]:
+        return [order.guess.reason for order in self.guesses if order.pass_index == 0]
+
+
+def ring_of_views() -> TrainingViews:
+    """72 training views on the upper half of a sphere."""
+    poses = [on_sphere(azimuth, elevation) for elevation in (10, 35, 60) for azimuth in range(0, 360, 15)]
+    return TrainingViews(tuple(f"train/r_{i}.png" for i in range(len(poses))), np.stack(poses))

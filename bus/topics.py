@@ -9,8 +9,8 @@ from typing import Literal
 from bus import messages
 from bus.errors import TransportError
 
-_PART = re.compile(r"[A-Za-z0-9_.\-]+|\*")
-_KEY_PART = r"[^/*$#?]+"
+_PART_OF_KEY = r"[A-Za-z0-9_.\-]+"
+_PART = re.compile(_PART_OF_KEY + r"|\*")
 
 
 @dataclass(frozen=True)
@@ -62,11 +62,17 @@ class Topic:
     def newest_only(self) -> bool:
         return self.capacity == 1
 
-    def matches(self, key: str) -> bool:
-        """Whether `key`, without wildcards, is a key of this topic."""
-        names = ("site", "object", "camera", "stage")
-        return re.fullmatch(self.template.format(**dict.fromkeys(names, _KEY_PART)), key) is not None
+    def address_of(self, key: str) -> Address | None:
+        """The pipeline that a concrete key of this topic belongs to; None where it is another topic's key."""
+        found = re.fullmatch(self.template.format(**_GROUPS), key)
+        return (
+            Address(**{name: part for name, part in found.groupdict().items() if name != "stage"})
+            if found
+            else None
+        )
 
+
+_GROUPS = {name: f"(?P<{name}>{_PART_OF_KEY})" for name in ("site", "object", "camera", "stage")}
 
 JOIN_CAPACITY = 64
 
@@ -97,4 +103,4 @@ BY_NAME: dict[str, Topic] = {topic.name: topic for topic in ALL}
 
 def topic_of(key: str) -> Topic | None:
     """The topic that a concrete key belongs to, None where it is none of ours."""
-    return next((topic for topic in ALL if topic.matches(key)), None)
+    return next((topic for topic in ALL if topic.address_of(key)), None)

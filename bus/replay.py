@@ -1,0 +1,260 @@
+"""Reading recordings: their messages, what they hold, what a damaged one still has, and sending them again."""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+import threading
+import time
+from collections.abc import Container, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import mcap.exceptions
+from mcap import records
+from mcap.reader import SeekingReader
+from mcap.stream_reader import CRCValidationError, StreamReader
+from mcap.writer import MCAP0_MAGIC
+
+from bus.codec import decode
+from bus.errors import CodecError, RecordingError
+from bus.messages import Message
+from bus.ports import Outbox
+from bus.protocol import Bus
+from bus.topics import Address, Topic, topic_of
+
+SOURCE_RECORD = "fieldpose.source"
+RECORDING_RECORD = "fieldpose.recording"
+_RECORD_LIMIT = 1 << 30
+_DAMAGE = (
+    mcap.exceptions.McapError, CRCValidationError, struct.error, EOFError, ValueError, KeyError, IndexError,
+    OverflowError, MemoryError, StopIteration, RuntimeError,
+)  # fmt: skip
+
+
+class Recorded(NamedTuple):
+    key: str
+    topic: Topic
+    message: Message
+    log_time_ns: int
+
+
+class Payload(NamedTuple):
+    """A message as it stands in the file, not yet checked."""
+
+    key: str
+    data: bytes
+    log_time_ns: int
+
+
+class Attachment(NamedTuple):
+    name: str
+    media_type: str
+    data: bytes
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    key: str
+    topic: str
+    messages: int
+    first_ns: int
+    last_ns: int
+    rate_hz: float
+
+
+@dataclass(frozen=True)
+class SourceInfo:
+    """`missing` did not reach the recorder; what is received and not written found its queue full."""
+
+    key: str
+    source: str
+    received: int
+    written: int
+    missing: int
+
+
+@dataclass(frozen=True)
+class RecordingInfo:
+    """What a recording holds; `lossless` says that every message sent is in it, by the senders' own numbers."""
+
+    path: str
+    size_bytes: int
+    messages: int
+    first_ns: int
+    last_ns: int
+    lossless: bool
+    topics: list[TopicInfo] = field(default_factory=list)
+    sources: list[SourceInfo] = field(default_factory=list)
+    metadata: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, int] = field(default_factory=dict)
+
+
+def read_recording(path: Path | str, topics: Container[Topic] | None = None) -> Iterator[Recorded]:
+    """The messages of a recording in the order of their receipt, of `topics` alone where given.
+
+    Raises RecordingError for a file that is no whole recording, or holds a message that is none of its topic.
+    """
+    for payload in _payloads(path):
+        topic = topic_of(payload.key)
+        if topic is None or (topics is not None and topic not in topics):
+            continue
+        try:
+            message = decode(payload.data, topic.message_type, topic.max_bytes)
+        except CodecError as error:
+            raise RecordingError(f"{path}: a message on {payload.key} cannot be read: {error}") from error
+        yield Recorded(payload.key, topic, message, payload.log_time_ns)
+
+
+def info(path: Path | str) -> RecordingInfo:
+    """What a recording holds. Raises RecordingError for a file that is no whole recording."""
+    times: dict[str, list[int]] = {}
+    for payload in _payloads(path):
+        times.setdefault(payload.key, []).append(payload.log_time_ns)
+    with _reader(path) as reader:
+        metadata = [(record.name, record.metadata) for record in reader.iter_metadata()]
+        attachments = {record.name: len(record.data) for record in reader.iter_attachments()}
+        sources = [_source_info(values) for name, values in metadata if name == SOURCE_RECORD]
+    named = {name: values for name, values in metadata if name != SOURCE_RECORD}
+    everything = [time_ns for key_times in times.values() for time_ns in key_times]
+    return RecordingInfo(
+        path=str(path),
+        size_bytes=os.path.getsize(path),
+        messages=len(everything),
+        first_ns=min(everything, default=0),
+        last_ns=max(everything, default=0),
+        lossless=named.get(RECORDING_RECORD, {}).get("lossless") == "true",
+        topics=[_topic_info(key, key_times) for key, key_times in sorted(times.items())],
+        sources=sorted(sources, key=lambda source: (source.key, source.source)),
+        metadata=named,
+        attachments=attachments,
+    )
+
+
+def read_attachment(path: Path | str, name: str) -> bytes:
+    """The bytes of an attachment. Raises RecordingError where there is none of that name."""
+    with _reader(path) as reader:
+        found = next((record.data for record in reader.iter_attachments() if record.name == name), None)
+    if found is None:
+        raise RecordingError(f"{path}: has no attachment {name!r}; `fieldpose info` lists what it has")
+    return found
+
+
+def replay(
+    bus: Bus,
+    path: Path | str,
+    topics: Container[Topic],
+    rate: float | None = 1.0,
+    address: Address | None = None,
+    source: str = "replay",
+    stop: threading.Event | None = None,
+) -> int:
+    """Send the recorded messages of `topics` again and return how many.
+
+    `rate` 2 is twice as fast as they came, None as fast as the bus takes them. Frame ids, passes and capture times
+    stay; source, sequence and sending time are new. They go where they came from, or to `address`.
+    """
+    stop = stop or threading.Event()
+    outboxes: dict[Address, Outbox] = {}
+    sent, first_ns, started = 0, None, time.monotonic()
+    for recorded in read_recording(path, topics):
+        first_ns = recorded.log_time_ns if first_ns is None else first_ns
+        due = started + ((recorded.log_time_ns - first_ns) / 1e9 / rate if rate else 0.0)
+        if stop.wait(max(0.0, due - time.monotonic())):
+            break
+        target = address or recorded.topic.address_of(recorded.key) or Address()
+        if target not in outboxes:
+            outboxes[target] = Outbox(bus, target, source)
+        outboxes[target].publish(recorded.topic, recorded.message)
+        sent += 1
+    return sent
+
+
+@dataclass
+class Salvage:
+    """What can be read of a damaged recording, up to the damage: `damage` says what that was, None where none."""
+
+    path: Path | str
+    metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
+    attachments: list[Attachment] = field(default_factory=list)
+    damage: str | None = None
+
+    def payloads(self) -> Iterator[Payload]:
+        """The messages in the order of the file; metadata and attachments are collected on the way.
+
+        Raises RecordingError where the file cannot be opened or does not begin as a recording.
+        """
+        channels: dict[int, str] = {}
+        try:
+            with _open(self.path) as stream:
+                if os.fstat(stream.fileno()).st_size < len(MCAP0_MAGIC):
+                    raise mcap.exceptions.InvalidMagic("too short")
+                for record in StreamReader(stream, validate_crcs=True, record_size_limit=_RECORD_LIMIT).records:
+                    if isinstance(record, records.Channel):
+                        channels[record.id] = record.topic
+                    elif isinstance(record, records.Message):
+                        yield Payload(channels[record.channel_id], record.data, record.log_time)
+                    elif isinstance(record, records.Metadata):
+                        self.metadata.append((record.name, record.metadata))
+                    elif isinstance(record, records.Attachment):
+                        self.attachments.append(Attachment(record.name, record.media_type, record.data))
+        except mcap.exceptions.InvalidMagic as error:
+            raise RecordingError(f"{self.path}: is no recording (MCAP file)") from error
+        except _DAMAGE as error:
+            self.damage = str(error) or type(error).__name__
+
+
+class _ExactReader(io.BufferedReader):
+    """Refuses to read past the end, where a plain file gives less than was asked for."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is None or size < 0:
+            return super().read(size)
+        # A damaged length is refused before memory is taken for it.
+        if size > io.DEFAULT_BUFFER_SIZE and size > os.fstat(self.fileno()).st_size - self.tell():
+            raise EOFError("the file ends within a record")
+        data = super().read(size)
+        if len(data) < size:
+            raise EOFError("the file ends within a record")
+        return data
+
+
+def _open(path: Path | str) -> _ExactReader:
+    try:
+        return _ExactReader(io.FileIO(path))
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
+
+
+@contextmanager
+def _reader(path: Path | str) -> Iterator[SeekingReader]:
+    with _open(path) as stream:
+        try:
+            yield SeekingReader(stream, validate_crcs=True, record_size_limit=_RECORD_LIMIT)
+        except mcap.exceptions.InvalidMagic as error:
+            raise RecordingError(f"{path}: is no recording (MCAP file)") from error
+        except (*_DAMAGE, OSError) as error:
+            detail = " ".join(str(error).split()) or type(error).__name__
+            hint = "`fieldpose recover` saves what is in it"
+            raise RecordingError(f"{path}: is not a whole recording ({detail}); {hint}") from error
+
+
+def _payloads(path: Path | str) -> Iterator[Payload]:
+    with _reader(path) as reader:
+        for _, channel, message in reader.iter_messages():
+            yield Payload(channel.topic, message.data, message.log_time)
+
+
+def _topic_info(key: str, times: list[int]) -> TopicInfo:
+    topic = topic_of(key)
+    first, last = min(times), max(times)
+    rate_hz = (len(times) - 1) / ((last - first) / 1e9) if last > first else 0.0
+    return TopicInfo(key, topic.name if topic else "", len(times), first, last, rate_hz)
+
+
+def _source_info(values: dict[str, str]) -> SourceInfo:
+    counts = (int(values[name]) for name in ("received", "written", "missing"))
+    return SourceInfo(values["key"], values["source"], *counts)

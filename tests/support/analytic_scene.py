@@ -74,6 +74,17 @@ class AnalyticScene:
         return torch.sigmoid(14 * (mixed - 0.5))
 
 
+def distance_to_surface(points: np.ndarray) -> np.ndarray:
+    """How far points (n, 3) are from the nearest surface of the scene, (n,)."""
+    distances = [np.abs(np.linalg.norm(points - centre, axis=1) - radius) for centre, radius in SPHERES]
+    for low, high in BOXES:
+        middle, half = (np.array(low) + high) / 2, (np.array(high) - low) / 2
+        outside = np.abs(points - middle) - half
+        across = np.linalg.norm(np.maximum(outside, 0), axis=1)
+        distances.append(np.abs(across + np.minimum(outside.max(axis=1), 0)))
+    return np.min(distances, axis=0)
+
+
 def camera(size: int = 200, distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)) -> Camera:
     """A square camera that sees the whole scene from 4 units away."""
     focal, centre = 1.35 * size, (size - 1) / 2

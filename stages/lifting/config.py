@@ -1,0 +1,26 @@
+"""Settings of the lifting stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class LiftingConfig:
+    """How lifted points are tested for consistency (the paper's section III-B)."""
+
+    views: int = 6
+    """nearby views from which each point is seen again; 0 turns the test off"""
+    angle_deg: float = 3.0
+    """how far around the point a nearby view is"""
+    gamma: float = 4.0
+    """points whose root mean square displacement exceeds it are discarded; the unit is that of gamma_unit"""
+    gamma_unit: Literal["pixel", "field"] = "pixel"
+    """pixel: what one pixel of the view covers at the point's depth; field: the field's own length unit"""
+    min_opacity: float = 0.5
+    """a pixel that is more transparent shows no surface"""
+    max_depth_step: float = 0.03
+    """depths of neighbouring pixels that differ by a larger share belong to two surfaces and are not mixed"""
+    min_kept: int = 6
+    """fewer consistent points than this are reported as a failure"""

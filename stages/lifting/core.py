@@ -1,0 +1,119 @@
+"""Lifting matched pixels to points of the object, and mining those that the field places consistently.
+
+The paper's sections III-A (back-projection with the rendered depth) and III-B (3-D consistent point mining): a
+point is looked at again from nearby views, and discarded where they do not see the surface at the same place.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry import Camera, rays
+from stages.lifting.config import LiftingConfig
+from stages.nerf.rendering_api import RayRenderer
+
+__all__ = ["Lifted", "LiftingConfig", "consistency", "depth_at", "lift"]
+
+_NEVER = np.float32(np.finfo(np.float32).max)
+
+
+@dataclass(frozen=True)
+class Lifted:
+    """points_in_object (n, 3) float32; consistency (n,) float32, the paper's m in squared units; kept (n,) bool.
+
+    Points of pixels that show no surface are at the camera's centre, with the largest finite consistency.
+    """
+
+    points_in_object: np.ndarray
+    consistency: np.ndarray
+    kept: np.ndarray
+
+
+def lift(
+    renderer: RayRenderer,
+    depth: np.ndarray,
+    opacity: np.ndarray,
+    camera: Camera,
+    cam_from_object: np.ndarray,
+    pixels_in_view: np.ndarray,
+    rng: np.random.Generator,
+    config: LiftingConfig | None = None,
+) -> Lifted:
+    """Lift pixels (n, 2) of a view and mark the points to keep.
+
+    depth (h, w) along the optical axis, opacity (h, w) in 0..1 or uint8, camera and cam_from_object are the view's.
+    `rng` turns the ring of nearby views; the renderer is asked once, for all points and views.
+    """
+    config = config or LiftingConfig()
+    depths = depth_at(depth, pixels_in_view, config.max_depth_step)
+    scale = 255.0 if opacity.dtype == np.uint8 else 1.0
+    seen = (depths > 0) & (_nearest(opacity, pixels_in_view) >= config.min_opacity * scale)
+    depths = np.where(seen, depths, 0).astype(np.float32)
+    origins, directions = rays(camera, cam_from_object, pixels_in_view)
+    points = origins + depths[:, None] * directions
+    spread = np.full(len(points), _NEVER, np.float32)
+    if seen.any():
+        spread[seen] = consistency(renderer, points[seen], origins[0], rng, config)
+    unit = 1.0 if config.gamma_unit == "field" else depths / camera.fx
+    return Lifted(points, spread, seen & (np.sqrt(spread) <= config.gamma * unit))
+
+
+def depth_at(depth: np.ndarray, pixels: np.ndarray, max_step: float) -> np.ndarray:
+    """Depth (n,) at pixels (n, 2): bilinear where the four around it are one surface, else that of the nearest.
+
+    One surface means that they differ by at most the share `max_step`; 0 in `depth` is no surface.
+    """
+    height, width = depth.shape
+    corner = np.clip(np.floor(pixels), 0, (max(width - 2, 0), max(height - 2, 0))).astype(int)
+    x, y = corner.T
+    right, below = np.minimum(x + 1, width - 1), np.minimum(y + 1, height - 1)
+    around = np.stack([depth[y, x], depth[y, right], depth[below, x], depth[below, right]])
+    lowest, highest = around.min(axis=0), around.max(axis=0)
+    smooth = (lowest > 0) & (highest - lowest <= max_step * highest)
+    u, v = np.clip(pixels - corner, 0, 1).T
+    mixed = np.array([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v]) * around
+    return np.where(smooth, mixed.sum(axis=0), _nearest(depth, pixels)).astype(np.float32)
+
+
+def consistency(
+    renderer: RayRenderer,
+    points: np.ndarray,
+    camera_centre: np.ndarray,
+    rng: np.random.Generator,
+    config: LiftingConfig,
+) -> np.ndarray:
+    """The paper's m (n,) float32: mean squared distance between points (n, 3) and where nearby views see them.
+
+    The views lie on a circle around the camera's centre, at the same distance from the point, evenly spaced.
+    """
+    if config.views == 0:
+        return np.zeros(len(points), np.float32)
+    centres = _nearby_centres(points, camera_centre, rng, config)
+    directions = points[None] - centres
+    rendered = renderer.render_rays(centres.reshape(-1, 3), directions.reshape(-1, 3))
+    # The point is at parameter 1 of its rays; a ray that meets nothing misses it by its whole distance.
+    off = (rendered.depth.reshape(directions.shape[:2]) - 1)[..., None] * directions
+    return (off**2).sum(axis=2).mean(axis=0).astype(np.float32)
+
+
+def _nearby_centres(
+    points: np.ndarray, camera_centre: np.ndarray, rng: np.random.Generator, config: LiftingConfig
+) -> np.ndarray:
+    """Camera centres (views, n, 3) float32, `angle_deg` around each point (n, 3) from the given centre (3,)."""
+    to_camera = (camera_centre - points).astype(np.float64)
+    aside = np.eye(3)[np.argmin(np.abs(to_camera), axis=1)]
+    first = np.cross(to_camera, aside)
+    first *= np.linalg.norm(to_camera, axis=1, keepdims=True) / np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(to_camera, first) / np.linalg.norm(to_camera, axis=1, keepdims=True)
+    around = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(config.views) / config.views
+    sideways = np.cos(around)[:, None, None] * first + np.sin(around)[:, None, None] * second
+    angle = np.deg2rad(config.angle_deg)
+    return (points + np.cos(angle) * to_camera + np.sin(angle) * sideways).astype(np.float32)
+
+
+def _nearest(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    height, width = image.shape
+    x, y = np.clip(np.rint(pixels), 0, (width - 1, height - 1)).astype(int).T
+    return image[y, x]

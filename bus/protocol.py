@@ -27,7 +27,7 @@ class Bus(Protocol):
     """Bytes by key, and tokens that live as long as their process; a "*" in a key listens to any one part."""
 
     def put(self, key: str, payload: bytes, topic: Topic) -> None:
-        """Send with the topic's priority and congestion control; nobody says whether it was received."""
+        """Send with the topic's priority; nobody says whether it was received."""
 
     def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:
         """Give what arrives to `sink`; while that is held up, `capacity` messages wait (1: the newest)."""

@@ -172,12 +172,14 @@ class RecordingWriter:
 
     def _set_aside(self, resume: bool) -> Path | None:
         aside = self._partial.with_name(self._partial.name + ".before")
-        if not resume and self._partial.exists():
+        # Killed before its first flush, a recording has nothing at all.
+        unfinished = self._partial.exists() and self._partial.stat().st_size > 0
+        if not resume and (unfinished or aside.exists()):
             raise RecordingError(
                 f"{self._partial}: an unfinished recording is in the way; `fieldpose recover` it, or remove it"
             )
         # A file set aside already is one whose taking over was itself interrupted: it has the older messages.
-        if self._partial.exists() and not aside.exists():
+        if unfinished and not aside.exists():
             os.replace(self._partial, aside)
         return aside if aside.exists() else None
 

@@ -55,7 +55,6 @@ class Topic:
     capacity: int = 64
     max_bytes: int = 4 << 20
     priority: Literal["data", "data_low"] = "data"
-    congestion: Literal["block_first", "drop"] = "block_first"
     recorded: bool = True
 
     @property
@@ -90,10 +89,7 @@ CORRESPONDENCES = Topic("correspondences", _PIPELINE + "correspondences", messag
 ESTIMATE = Topic("estimate", _PIPELINE + "estimate", messages.Estimate)
 POSE = Topic("pose", _PIPELINE + "pose", messages.Pose, max_bytes=64 << 10)
 STATE = Topic("state", _PIPELINE + "state", messages.State, max_bytes=64 << 10)
-STATS = Topic(
-    "stats", "{site}/stats/{object}/{camera}/{stage}", messages.Stats, capacity=256, max_bytes=16 << 10,
-    congestion="drop",
-)  # fmt: skip
+STATS = Topic("stats", "{site}/stats/{object}/{camera}/{stage}", messages.Stats, capacity=256, max_bytes=16 << 10)
 
 ALL: tuple[Topic, ...] = (
     FRAME, TRUTH, GUESS, VIEW, MATCHES, CORRESPONDENCES, ESTIMATE, POSE, STATE, STATS,

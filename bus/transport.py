@@ -30,7 +30,9 @@ _LOCAL_PEER = "tcp/127.0.0.1:0"
 _POOL_BYTES = 128 << 20
 _ENDPOINT = re.compile(r"[a-z]+/.+:\d{1,5}([?#].*)?")
 _PRIORITIES = {"data": zenoh.Priority.DATA, "data_low": zenoh.Priority.DATA_LOW}
-_CONGESTION = {"block_first": zenoh.CongestionControl.BLOCK_FIRST, "drop": zenoh.CongestionControl.DROP}
+# One message may wait for a slow receiver and those behind it are dropped. BLOCK lets the slowest receiver throttle
+# everyone and closes its link in the end, DROP loses messages to a receiver that is only busy for a moment.
+_CONGESTION = zenoh.CongestionControl.BLOCK_FIRST
 
 
 class ZenohBus:
@@ -74,7 +76,7 @@ class ZenohBus:
             publisher = self._publishers.get(key)
             if publisher is None:
                 publisher = self._publishers[key] = self._session.declare_publisher(
-                    key, priority=_PRIORITIES[topic.priority], congestion_control=_CONGESTION[topic.congestion]
+                    key, priority=_PRIORITIES[topic.priority], congestion_control=_CONGESTION
                 )
             publisher.put(payload)
         except zenoh.ZError as error:

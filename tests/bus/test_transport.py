@@ -1,0 +1,255 @@
+"""One contract for every bus, and what only the one over Zenoh can show: processes that come, go and die."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+from bus.errors import TransportError
+from bus.ports import Inbox, Outbox
+from bus.topics import FRAME, GUESS, STATS, TRUTH, Address
+from bus.transport import Bus, MemoryBus, ZenohBus, serve_hub, wait_for
+from support.bus_samples import ADDRESS, frame, guess, same, truth
+
+Sessions = tuple[Bus, Bus]
+
+
+def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> bool:
+    deadline = time.monotonic() + timeout_s
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return condition()
+
+
+def meet(sender: Bus, receiver: Bus) -> None:
+    """Return once the receiver, subscribed already, is known to the sender."""
+    receiver.hold(ADDRESS.live("receiver"))
+    wait_for(sender, ADDRESS, ["receiver"], 5.0)
+
+
+class TestContract:
+    def test_every_message_arrives_in_order_with_its_key(self, sessions: Sessions) -> None:
+        sender, receiver = sessions
+        inbox = Inbox(receiver, ADDRESS, [GUESS])
+        meet(sender, receiver)
+        outbox = Outbox(sender, ADDRESS, "tracking")
+        for frame_id in range(50):
+            outbox.publish(GUESS, guess(frame_id))
+        received = [inbox.get(5.0) for _ in range(50)]
+        assert [item.message.header.frame_id for item in received if item] == list(range(50))
+        assert [item.message.header.sequence for item in received if item] == list(range(50))
+        assert {(item.key, item.message.header.source) for item in received if item} == {
+            ("test/track/mug/cam/guess", "tracking")
+        }
+        assert inbox.counts.gaps == 0
+
+    def test_an_image_arrives_as_it_was(self, sessions: Sessions) -> None:
+        sender, receiver = sessions
+        inbox = Inbox(receiver, ADDRESS, [FRAME])
+        meet(sender, receiver)
+        sent = frame(7, width=480, height=360)
+        Outbox(sender, ADDRESS, "camera").publish(FRAME, sent)
+        received = inbox.get(5.0)
+        assert received is not None
+        assert same(received.message.image, sent.image)  # type: ignore[attr-defined]
+        assert not received.message.image.flags.writeable  # type: ignore[attr-defined]
+
+    def test_other_keys_do_not_arrive_and_wildcards_listen_to_several(self, sessions: Sessions) -> None:
+        sender, receiver = sessions
+        everything = Inbox(receiver, Address("test", "*", "*"), [GUESS])
+        only_mug = Inbox(receiver, ADDRESS, [GUESS, TRUTH])
+        meet(sender, receiver)
+        Outbox(sender, Address("test", "cup", "cam"), "tracking").publish(GUESS, guess(1))
+        Outbox(sender, Address("elsewhere", "mug", "cam"), "tracking").publish(GUESS, guess(2))
+        Outbox(sender, ADDRESS, "tracking").publish(GUESS, guess(3))
+        assert [item.message.header.frame_id for item in (everything.get(5.0), everything.get(5.0)) if item] == [1, 3]
+        mug = only_mug.get(5.0)
+        assert mug is not None
+        assert mug.message.header.frame_id == 3
+        assert everything.get(0.05) is None
+        assert only_mug.get(0.0) is None
+
+    def test_a_newest_only_input_holds_the_newest_and_counts_what_it_let_go(self, sessions: Sessions) -> None:
+        sender, receiver = sessions
+        inbox = Inbox(receiver, ADDRESS, [FRAME])
+        meet(sender, receiver)
+        outbox = Outbox(sender, ADDRESS, "camera")
+        outbox.publish(FRAME, frame(0))
+        assert inbox.get(5.0) is not None
+        for frame_id in range(1, 11):
+            outbox.publish(FRAME, frame(frame_id))
+        last = []
+        assert until(lambda: last.extend(inbox.drain()) or bool(last and last[-1].message.header.frame_id == 10))
+        assert inbox.counts.skipped + inbox.counts.received == 11
+        assert inbox.counts.gaps == 0
+        assert len(last) < 10
+
+    def test_a_full_queue_drops_its_oldest_and_counts_the_gap(self, sessions: Sessions) -> None:
+        sender, receiver = sessions
+        inbox = Inbox(receiver, ADDRESS, [GUESS, TRUTH], {GUESS: 4})
+        meet(sender, receiver)
+        outbox = Outbox(sender, ADDRESS, "tracking")
+        outbox.publish(GUESS, guess(0))
+        assert inbox.get(5.0) is not None
+        for frame_id in range(1, 11):
+            outbox.publish(GUESS, guess(frame_id))
+        outbox.publish(TRUTH, truth(99))
+        assert until(lambda: len(inbox._queues[1].items) == 1 and inbox._queues[0].items[-1][3] > 0)
+        time.sleep(0.05)
+        assert [item.message.header.frame_id for item in inbox.drain()] == [7, 8, 9, 10, 99]
+        assert inbox.counts.gaps == 6
+
+    def test_nothing_arrives_after_the_end_of_a_subscription(self, sessions: Sessions) -> None:
+        sender, receiver = sessions
+        inbox = Inbox(receiver, ADDRESS, [GUESS])
+        meet(sender, receiver)
+        inbox.close()
+        Outbox(sender, ADDRESS, "tracking").publish(GUESS, guess())
+        assert inbox.get(0.1) is None
+
+    def test_a_waiting_reader_wakes_at_once(self, sessions: Sessions) -> None:
+        sender, receiver = sessions
+        inbox = Inbox(receiver, ADDRESS, [GUESS])
+        meet(sender, receiver)
+        outbox = Outbox(sender, ADDRESS, "tracking")
+        outbox.publish(GUESS, guess())
+        assert inbox.get(5.0) is not None
+        delays_ms = []
+        for _ in range(20):
+            threading.Timer(0.01, outbox.publish, (GUESS, guess())).start()
+            received = inbox.get(5.0)
+            assert received is not None
+            delays_ms.append((time.time_ns() - received.message.header.sent_ns) / 1e6)
+        assert sorted(delays_ms)[10] < 15.0
+
+    def test_tokens_appear_and_disappear(self, sessions: Sessions) -> None:
+        ours, theirs = sessions
+        changes: list[tuple[str, bool]] = []
+        before = theirs.hold("test/live/mug/cam/before")
+        assert until(lambda: ours.live("test/live/*/*/*") == {"test/live/mug/cam/before"})
+        watching = ours.watch("test/live/mug/cam/*", lambda key, alive: changes.append((key.split("/")[-1], alive)))
+        theirs.hold("test/live/cup/cam/other")
+        later = theirs.hold("test/live/mug/cam/later")
+        assert until(lambda: len(changes) == 2)
+        before.close()
+        assert until(lambda: len(changes) == 3)
+        watching.close()
+        later.close()
+        assert until(lambda: ours.live("test/live/mug/*/*") == set())
+        assert changes == [("before", True), ("later", True), ("before", False)]
+
+    def test_closing_a_session_lets_its_tokens_go(self, sessions: Sessions) -> None:
+        ours, theirs = sessions
+        theirs.hold(ADDRESS.live("pnp"))
+        assert until(lambda: ours.live(ADDRESS.live("*")) == {"test/live/mug/cam/pnp"})
+        theirs.close()
+        assert until(lambda: ours.live(ADDRESS.live("*")) == set())
+
+    def test_waiting_for_stages_names_the_missing_ones(self, sessions: Sessions) -> None:
+        ours, theirs = sessions
+        theirs.hold(ADDRESS.live("pnp"))
+        wait_for(ours, ADDRESS, ["pnp"], 5.0)
+        with pytest.raises(TransportError, match=r"after 0\.1 s: camera, lifting; is"):
+            wait_for(ours, ADDRESS, ["lifting", "pnp", "camera"], 0.1)
+
+    def test_a_late_stage_is_waited_for(self, sessions: Sessions) -> None:
+        ours, theirs = sessions
+        threading.Timer(0.1, theirs.hold, (ADDRESS.live("late"),)).start()
+        wait_for(ours, ADDRESS, ["late"], 5.0)
+        assert ADDRESS.live("late") in ours.live(ADDRESS.live("*"))
+
+
+class TestKeys:
+    def test_stats_keys_name_the_stage(self) -> None:
+        assert ADDRESS.key(STATS, "pnp") == "test/stats/mug/cam/pnp"
+        assert STATS.address_of("test/stats/mug/cam/pnp") == ADDRESS
+
+    @pytest.mark.parametrize("part", ["", "a/b", "a b", "**", "a*", "é"])
+    def test_a_part_that_is_no_part_is_refused(self, part: str) -> None:
+        with pytest.raises(TransportError):
+            Address(object=part)
+
+
+HOLDER = """
+    import sys, time
+    from bus.transport import ZenohBus
+    from support.bus_samples import ADDRESS, frame
+    from bus.ports import Outbox
+    from bus.topics import FRAME
+    bus = ZenohBus(sys.argv[1])
+    bus.hold(ADDRESS.live("camera"))
+    outbox = Outbox(bus, ADDRESS, "camera")
+    for frame_id in range(100_000):
+        outbox.publish(FRAME, frame(frame_id, width=120, height=90))
+        time.sleep(0.02)
+"""
+HUB = "import sys; from bus.transport import serve_hub; serve_hub(sys.argv[1])"
+
+
+class TestProcesses:
+    def test_a_killed_process_loses_its_token_within_a_second(self, hub: str, spawn) -> None:
+        bus = ZenohBus(hub)
+        process = spawn(HOLDER, hub)
+        wait_for(bus, ADDRESS, ["camera"], 10.0)
+        process.send_signal(signal.SIGKILL)
+        assert until(lambda: not bus.live(ADDRESS.live("camera")), 1.0)
+        bus.close()
+
+    def test_any_order_of_start_and_a_hub_that_dies(self, endpoint: str, spawn) -> None:
+        bus = ZenohBus(endpoint)
+        with pytest.raises(TransportError, match="no hub answers"):
+            bus.wait_for_hub(0.05)
+        spawn(HOLDER, endpoint)
+        inbox = Inbox(bus, ADDRESS, [FRAME])
+        first = spawn(HUB, endpoint)
+        bus.wait_for_hub(10.0)
+        assert inbox.get(10.0) is not None
+        first.kill()
+        first.wait()
+        time.sleep(0.2)
+        second = spawn(HUB, endpoint)
+        bus.wait_for_hub(10.0)
+        newcomer = ZenohBus(endpoint)
+        late = Inbox(newcomer, ADDRESS, [FRAME])
+        assert late.get(10.0) is not None
+        inbox.drain()
+        assert inbox.get(5.0) is not None
+        second.terminate()
+        assert second.wait(5.0) == 0
+        newcomer.close()
+        bus.close()
+
+    def test_two_hubs_on_one_port_is_one_clear_line(self, hub: str) -> None:
+        with pytest.raises(TransportError, match="no hub at .* in use") as caught:
+            serve_hub(hub)
+        assert "\n" not in str(caught.value)
+
+    @pytest.mark.parametrize("address", ["127.0.0.1:7447", "tcp/127.0.0.1", "pigeon/127.0.0.1:7447"])
+    def test_an_address_that_is_none_is_refused(self, address: str) -> None:
+        with pytest.raises(TransportError):
+            ZenohBus(address)
+
+    def test_a_setting_that_is_none_is_refused(self, hub: str) -> None:
+        with pytest.raises(TransportError):
+            ZenohBus(hub, settings={"transport/nonsense": 1})
+
+    def test_zenoh_logs_to_stderr_and_prints_stay_on_stdout(self, endpoint: str, spawn) -> None:
+        program = """
+            import sys
+            from bus.transport import ZenohBus, log_to_stderr
+            log_to_stderr("warn")
+            print("before", flush=True)
+            ZenohBus(sys.argv[1]).close()
+            print("after")
+        """
+        out, err = spawn(program, endpoint).communicate(timeout=20.0)
+        assert out == "before\nafter\n"
+        assert "zenoh" in err
+
+    def test_memory_buses_are_separate_unless_neighbours(self) -> None:
+        inbox = Inbox(MemoryBus(), ADDRESS, [GUESS])
+        Outbox(MemoryBus(), ADDRESS, "tracking").publish(GUESS, guess())
+        assert inbox.get(0.0) is None

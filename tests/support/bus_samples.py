@@ -1,0 +1,131 @@
+"""One valid message of every type, and the address that the bus tests send them to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from bus import topics
+from bus.messages import (
+    CameraModel, Correspondences, Estimate, Frame, Guess, GuessReason, Header, Matches, Message, Pose, Reason, State,
+    Stats, TrackingState, Truth, View,
+)  # fmt: skip
+from bus.ports import first_header
+from bus.topics import Address, Topic
+
+ADDRESS = Address("test", "mug", "cam")
+CAMERA = CameraModel(6, 4, 5.0, 5.0, 2.5, 1.5, (0.1, 0.0, 0.0, 0.0, -0.2))
+
+
+def pixels(count: int, columns: int = 2) -> np.ndarray:
+    return np.arange(count * columns, dtype=np.float32).reshape(count, columns)
+
+
+def scores(count: int) -> np.ndarray:
+    return np.linspace(0, 1, count, dtype=np.float32)
+
+
+def frame(frame_id: int = 0, width: int = 6, height: int = 4, header: Header | None = None) -> Frame:
+    image = np.random.default_rng(frame_id).integers(0, 256, (height, width, 3), dtype=np.uint8)
+    camera = CameraModel(width, height, 5.0, 5.0, 2.5, 1.5)
+    return Frame(header=header or first_header(frame_id, 1000 + frame_id), image=image, encoding="rgb8", camera=camera)
+
+
+def truth(frame_id: int = 0) -> Truth:
+    return Truth(header=first_header(frame_id, 1000 + frame_id), cam_from_object=np.eye(4))
+
+
+def guess(frame_id: int = 0, pass_index: int = 0) -> Guess:
+    header = first_header(frame_id, 1000 + frame_id, pass_index)
+    return Guess(header=header, reason=GuessReason.PRIOR, cam_from_object=np.eye(4), camera=CAMERA)
+
+
+def view(frame_id: int = 0, pass_index: int = 0, ok: bool = True, reason: Reason = Reason.OK) -> View:
+    return View(
+        header=first_header(frame_id, 1000 + frame_id, pass_index),
+        ok=ok,
+        reason=reason,
+        view_id="v1",
+        cam_from_object=np.eye(4),
+        camera=CAMERA,
+        rgb=np.full((4, 6, 3), 7, np.uint8),
+        depth=np.ones((4, 6), np.float32),
+        opacity=np.full((4, 6), 255, np.uint8),
+    )
+
+
+def matches(header: Header, count: int = 5, ok: bool = True, reason: Reason = Reason.OK) -> Matches:
+    return Matches(
+        header=header,
+        ok=ok,
+        reason=reason,
+        view_id="v1",
+        pixels_in_view=pixels(count),
+        pixels_in_frame=pixels(count),
+        confidence=scores(count),
+    )
+
+
+def every_message() -> dict[Topic, Message]:
+    """One message for each topic of the table."""
+    header = first_header(3, 1003, 1)
+    result: dict[str, Any] = {"header": header, "ok": True, "reason": Reason.OK}
+    pose: dict[str, Any] = {"cam_from_object": np.eye(4), "covariance": np.eye(6)}
+    return {
+        topics.FRAME: frame(3),
+        topics.TRUTH: Truth(header=header, cam_from_object=None),
+        topics.GUESS: guess(3),
+        topics.VIEW: view(3),
+        topics.MATCHES: matches(header),
+        topics.CORRESPONDENCES: Correspondences(
+            **result,
+            camera=CAMERA,
+            guess_cam_from_object=np.eye(4),
+            pixels_in_frame=pixels(5),
+            points_in_object=pixels(5, 3),
+            confidence=scores(5),
+            consistency=scores(5),
+            kept=np.array([True, False, True, True, False]),
+        ),
+        topics.ESTIMATE: Estimate(
+            **result, **pose, camera=CAMERA, inliers_in_frame=pixels(3), correspondences=5, residual_px=0.5
+        ),
+        topics.POSE: Pose(
+            **result, **pose, inliers=3, correspondences=5, residual_px=0.5, refined=True, loss_before=2.0, loss_after=1.0
+        ),
+        topics.STATE: State(
+            header=header,
+            state=TrackingState.TRACKING,
+            score=0.9,
+            **pose,
+            in_flight=1,
+            admitted=9,
+            finished=8,
+            dropped_at_the_door=4,
+            lost=0,
+        ),
+        topics.STATS: Stats(
+            header=header,
+            stage="pnp",
+            ready=True,
+            received=5,
+            published=4,
+            refused=0,
+            gaps=0,
+            skipped=0,
+            failed=0,
+            busy_ms_p50=1.5,
+            busy_ms_p90=2.5,
+            cpu_s=3.0,
+            rss_mb=80.0,
+        ),
+    }
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two messages are equal, arrays by type, shape and value."""
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and np.array_equal(a, b)
+    if isinstance(a, Message):
+        return type(a) is type(b) and all(same(getattr(a, f), getattr(b, f)) for f in a.__struct_fields__)
+    return bool(a == b)

@@ -82,14 +82,18 @@ class Camera:
         return ideal * (self.fx, self.fy) + (self.cx, self.cy)
 
     def _undistort(self, distorted: np.ndarray) -> np.ndarray:
-        """Invert the distortion of normalised image points (n, 2) by Newton's method."""
+        """Invert the distortion of normalised image points (n, 2) by Newton's method.
+
+        Solutions where the derivative is not positive lie beyond the fold of the image and are none.
+        """
         ideal = distorted.copy()
         tolerance = _INVERSE_TOLERANCE_PX / max(self.fx, self.fy)
         for _ in range(_NEWTON_STEPS):
             predicted, jacobian = distort(ideal, self.distortion)
             residual = predicted - distorted
             determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
-            failed = ~((np.abs(residual) < tolerance).all(axis=1) & (determinant > 0))
+            folded = (determinant <= 0) | (jacobian[:, 0, 0] + jacobian[:, 1, 1] <= 0)
+            failed = folded | (np.abs(residual) >= tolerance).any(axis=1)
             if not failed.any():
                 return ideal
             ideal -= _solve_2x2(jacobian, determinant, residual)

@@ -60,7 +60,7 @@ def unbounded_bounds(poses: Sequence[np.ndarray], depths: tuple[float, float] | 
     else:
         harmonic_mean = 2 / (1 / depths[0] + 1 / depths[1])
         centre = centres.mean(axis=0) + harmonic_mean * _mean_direction(poses)
-    radius = _AROUND_THE_CAMERAS * float(np.linalg.norm(centres - centre, axis=1).max())
+    radius = _AROUND_THE_CAMERAS * float(np.linalg.norm(centres - centre, axis=1).max()) or 1.0
     near = _NEAR_SHARE_OF_RADIUS * radius if depths is None else 0.9 * depths[0]
     aabb = np.stack([centre - radius, centre + radius])
     return SceneBounds(centre, radius, aabb, near, None if depths is None else depths[1])
@@ -69,8 +69,8 @@ def unbounded_bounds(poses: Sequence[np.ndarray], depths: tuple[float, float] | 
 def nearest_point_to_axes(poses: Sequence[np.ndarray]) -> np.ndarray:
     """The point (3,) with the least sum of squared distances to the optical axes.
 
-    Where the axes do not meet in front of the cameras (one camera, or all parallel), a point in front of the middle
-    camera, as far away as the cameras are spread.
+    Where the axes do not meet in front of the cameras: ahead of their middle, as far as the cameras are spread if
+    they all face one way, and in their middle if they look all around.
     """
     centres, forwards = _centres(poses), np.stack([cam_from_object[2, :3] for cam_from_object in poses])
     across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
@@ -85,9 +85,8 @@ def nearest_point_to_axes(poses: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _mean_direction(poses: Sequence[np.ndarray]) -> np.ndarray:
-    total = np.sum([cam_from_object[2, :3] for cam_from_object in poses], axis=0)
-    length = np.linalg.norm(total)
-    return total / length if length > 1e-9 else np.asarray(poses[0][2, :3])
+    """Of unit length where all cameras face one way, zero where they look all around."""
+    return np.mean([cam_from_object[2, :3] for cam_from_object in poses], axis=0)
 
 
 def _centres(poses: Sequence[np.ndarray]) -> np.ndarray:

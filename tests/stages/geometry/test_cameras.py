@@ -76,6 +76,16 @@ def test_a_distortion_that_folds_the_image_is_refused() -> None:
         folding.directions(np.array([[320.0, 240.0], [0.0, 0.0]]))
 
 
+@pytest.mark.parametrize(
+    ("k1", "k2", "radius"), [(-0.5, 0.0, 0.56), (-0.5, 0.0, 0.7), (-0.5, 0.0, 1.5), (1.0, -0.5, 1.67)]
+)
+def test_solutions_beyond_the_fold_are_none(k1: float, k2: float, radius: float) -> None:
+    """Mirrored (radial factor below zero) and folded (derivative below zero) ones."""
+    camera = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, (k1, k2, 0.0, 0.0, 0.0))
+    with pytest.raises(StageError, match="no inverse"):
+        camera.directions(np.array([[320.0 + 300 * radius, 240.0]]))
+
+
 @given(cameras(), st.integers(8, 1000), st.integers(8, 1000))
 def test_resizing_keeps_the_rays_through_the_image(camera: Camera, width: int, height: int) -> None:
     small = camera.resized(width, height)

@@ -7,7 +7,7 @@ from PIL import Image
 from support import posed_images as made
 
 from stages.errors import DatasetError
-from stages.geometry import camera_centre, inverse, look_at, rotation_error_deg, translation_error
+from stages.geometry import camera_centre, inverse, is_rigid, look_at, rotation_error_deg, translation_error
 from stages.nerf.datasets import Dataset, find_name, load_dataset
 
 SQUARE = made.centred(80, 80, 95.0)
@@ -107,7 +107,7 @@ def test_depth_may_be_an_array_file(tmp_path: Path) -> None:
 
 def test_transparent_images_lie_over_the_background_and_edges_keep_their_colour(tmp_path: Path) -> None:
     made.write_blender(tmp_path, SQUARE)
-    pixels = np.zeros((80, 80, 4), np.uint8)
+    pixels = np.full((80, 80, 4), (250, 0, 250, 0), np.uint8)
     pixels[:, 41:] = (10, 200, 30, 255)
     made.save(tmp_path / "train/r_0.png", pixels)
     dataset = load_dataset(tmp_path, size=40)
@@ -300,18 +300,42 @@ def test_bounds_of_objects_and_scenes(tmp_path: Path) -> None:
     assert dataset.bounds.far == pytest.approx(10 / 0.75)
 
 
-def test_bounds_of_cameras_that_face_one_way_lie_ahead_of_them(tmp_path: Path) -> None:
+@pytest.mark.parametrize("fan", [0.0, 0.3])
+def test_bounds_of_cameras_that_face_one_way_or_apart_lie_ahead_of_them(tmp_path: Path, fan: float) -> None:
     made.write_transforms(tmp_path, made.CAMERA, count=3)
     for i, x in enumerate((-1.0, 0.0, 1.0)):
-        pose = look_at((x, 0, 0), (x, 5, 0), (0, 0, 1))
+        pose = look_at((x, 0, 0), (x + fan * x, 1, 0), (0, 0, 1))
         made.edit_frame(tmp_path / "transforms.json", i, transform_matrix=made.opengl(pose))
-    np.testing.assert_allclose(load_dataset(tmp_path, holdout=None).bounds.centre, (0, 1, 0), atol=1e-6)
+    np.testing.assert_allclose(load_dataset(tmp_path, holdout=None).bounds.centre, (0, 1, 0), atol=0.03)
+
+
+def test_bounds_of_cameras_that_look_outwards_lie_around_them(tmp_path: Path) -> None:
+    poses = made.write_transforms(tmp_path, made.CAMERA, count=8)
+    for i, pose in enumerate(poses):
+        eye = camera_centre(pose) + np.array((1, 2, 0))
+        outwards = made.opengl(look_at(eye, eye + camera_centre(pose) * (1, 1, 0), (0, 0, 1)))
+        made.edit_frame(tmp_path / "transforms.json", i, transform_matrix=outwards)
+    bounds = load_dataset(tmp_path, holdout=None).bounds
+    np.testing.assert_allclose(bounds.centre, (1, 2, 2.4), atol=1e-6)
+    assert bounds.radius == pytest.approx(1.05 * 4 * 0.8)
+
+
+def test_rounded_poses_become_rigid(tmp_path: Path) -> None:
+    poses = made.write_transforms(tmp_path, made.CAMERA)
+    rounded = np.round(made.opengl(poses[0]), 4)
+    made.edit_frame(tmp_path / "transforms.json", 0, transform_matrix=rounded.tolist())
+    found = load_dataset(tmp_path).images[0].cam_from_object
+    assert is_rigid(found, 1e-12)
+    np.testing.assert_allclose(found, poses[0], atol=5e-4)
 
 
 def test_bounds_do_not_depend_on_the_split(tmp_path: Path) -> None:
     made.write_blender(tmp_path, SQUARE)
     train, test = load_dataset(tmp_path, "train").bounds, load_dataset(tmp_path, "test").bounds
     np.testing.assert_array_equal(train.aabb, test.aabb)
+    elsewhere = made.opengl(look_at((9, 9, 9), (5, 0, 0), (0, 0, 1)))
+    made.edit_frame(tmp_path / "transforms_test.json", 0, transform_matrix=elsewhere)
+    np.testing.assert_array_equal(load_dataset(tmp_path, "all").bounds.aabb, train.aabb)
 
 
 def test_content_hash_knows_the_poses_and_the_pixels(tmp_path: Path) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.geometry.cameras import Camera, rays
+from stages.geometry.cameras import Camera
 from stages.nerf.field import Field
 from stages.nerf.kernels.jacobian import render_jacobian
 from stages.nerf.kernels.render import render
 from stages.nerf.metadata import FieldMetadata
+from stages.nerf.normalise import by_object_rays, normalised, tile_view
 from stages.nerf.rendering_api import RenderedRays, RenderedView
 from stages.nerf.workers import Workers
 
@@ -18,7 +19,6 @@ STOP_BELOW = 5e-3
 JACOBIAN_STOP_BELOW = 1e-3
 CHUNK = 1024
 JACOBIAN_ROWS = 8192
-TILE = 8
 
 
 class NumbaRenderer:
@@ -33,17 +33,9 @@ class NumbaRenderer:
         self._workers = Workers(field.metadata.config, threads, PACKET, PACKET * PER_RAY, backward=False)
         self._jacobian_workers: Workers | None = None
 
-    def normalised(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Origins and unit directions in the field's coordinates, and the length of the directions there (n,)."""
-        space = self.metadata.space
-        o = ((np.asarray(origins, np.float64) - space.centre) / space.scale).astype(np.float32)
-        d = np.asarray(directions, np.float64) / space.scale
-        length = np.linalg.norm(d, axis=1, keepdims=True)
-        return o, (d / length).astype(np.float32), length[:, 0].astype(np.float32)
-
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
         """See RayRenderer."""
-        o, d, length = self.normalised(origins, directions)
+        o, d, length = normalised(self.metadata.space, origins, directions)
         n = len(o)
         rgb, depth, opacity = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
         jitter = np.full(n, 0.5, np.float32)
@@ -66,7 +58,7 @@ class NumbaRenderer:
             self._jacobian_workers = Workers(
                 self.metadata.config, self._workers.threads, PACKET // 2, JACOBIAN_ROWS, backward=True
             )
-        o, d, length = self.normalised(origins, directions)
+        o, d, length = normalised(self.metadata.space, origins, directions)
         n, k = len(o), len(channel_weights)
         rgb, depth, opacity = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
         jacobian = np.zeros((n, k, 6), np.float32)
@@ -80,37 +72,14 @@ class NumbaRenderer:
                 PER_RAY, JACOBIAN_STOP_BELOW, s.samples, s.rays, rgb, depth, opacity, jacobian,
             ),
         )  # fmt: skip
-        return RenderedRays(rgb, depth / length, opacity), self._by_object_rays(jacobian, d, length)
-
-    def _by_object_rays(self, jacobian: np.ndarray, unit: np.ndarray, length: np.ndarray) -> np.ndarray:
-        """From normalised origin and unit direction to the caller's origin and direction."""
-        scale = np.float32(self.metadata.space.scale)
-        by_unit = jacobian[..., 3:]
-        along = np.sum(by_unit * unit[:, None], axis=-1, keepdims=True)
-        by_direction = (by_unit - along * unit[:, None]) / (length[:, None, None] * scale)
-        return np.concatenate([jacobian[..., :3] / scale, by_direction], axis=-1)
+        return RenderedRays(rgb, depth / length, opacity), by_object_rays(self.metadata.space, jacobian, d, length)
 
     def render_view(self, camera: Camera, cam_from_object: np.ndarray) -> RenderedView:
-        """See RayRenderer. Rays are traced tile by tile, so that a packet's rays read the same table entries."""
-        order = tile_order(camera.width, camera.height)
-        origins, directions = rays(camera, cam_from_object, camera.grid()[order])
-        traced = self.render_rays(origins, directions)
-        shape = (camera.height, camera.width)
-        rgb, depth, opacity = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.float32)
-        rgb.reshape(-1, 3)[order] = (traced.rgb * 255 + 0.5).astype(np.uint8)
-        depth.reshape(-1)[order] = traced.depth
-        opacity.reshape(-1)[order] = traced.opacity
-        return RenderedView(rgb, depth, opacity, camera, cam_from_object)
+        """See RayRenderer."""
+        return tile_view(self.render_rays, camera, cam_from_object)
 
     def close(self) -> None:
         """End the threads."""
         self._workers.close()
         if self._jacobian_workers is not None:
             self._jacobian_workers.close()
-
-
-def tile_order(width: int, height: int, tile: int = TILE) -> np.ndarray:
-    """Row-major pixel indices in the order of square tiles."""
-    y, x = np.divmod(np.arange(width * height), width)
-    key = ((y // tile) * (-(-width // tile)) + x // tile) * tile * tile + (y % tile) * tile + x % tile
-    return np.argsort(key, kind="stable")

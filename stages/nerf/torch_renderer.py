@@ -1,0 +1,65 @@
+"""Render a field with torch: the slow oracle on the CPU, the fast path on CUDA."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from stages.geometry.cameras import Camera
+from stages.nerf.field import Field
+from stages.nerf.normalise import by_object_rays, normalised, tile_view
+from stages.nerf.rendering_api import RenderedRays, RenderedView
+from stages.nerf.twin import TwinField, twin_of
+
+CHUNK = 4096
+
+
+class TorchRenderer:
+    """Implements RayRenderer; evaluates every occupied sample of a ray."""
+
+    def __init__(self, field: Field, device: torch.device | str = "cpu"):
+        self.metadata = field.metadata
+        self._twin: TwinField = twin_of(field, device)
+
+    def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
+        """See RayRenderer."""
+        o, d, length = normalised(self.metadata.space, origins, directions)
+        parts = []
+        with torch.inference_mode():
+            for start in range(0, len(o), CHUNK):
+                rays = self._trace(self._tensor(o[start : start + CHUNK]), self._tensor(d[start : start + CHUNK]))
+                parts.append([a.cpu().numpy() for a in (rays.rgb, rays.depth, rays.opacity)])
+        if not parts:
+            return RenderedRays(np.empty((0, 3), np.float32), np.empty(0, np.float32), np.empty(0, np.float32))
+        rgb, depth, opacity = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return RenderedRays(np.clip(rgb, 0, 1), depth / length, opacity)
+
+    def render_rays_jacobian(
+        self, origins: np.ndarray, directions: np.ndarray, channel_weights: np.ndarray
+    ) -> tuple[RenderedRays, np.ndarray]:
+        """See RayRenderer."""
+        o, d, length = normalised(self.metadata.space, origins, directions)
+        ot, dt = self._tensor(o).requires_grad_(), self._tensor(d).requires_grad_()
+        rays = self._trace(ot, dt)
+        rows = []
+        for weights in channel_weights:
+            value = (rays.rgb @ self._tensor(np.asarray(weights, np.float32))).sum()
+            gradients = torch.autograd.grad(value, (ot, dt), retain_graph=True)
+            rows.append(torch.cat(gradients, 1).cpu().numpy())
+        jacobian = np.stack(rows, axis=1)
+        rgb, depth, opacity = (a.detach().cpu().numpy() for a in (rays.rgb, rays.depth, rays.opacity))
+        return RenderedRays(rgb, depth / length, opacity), by_object_rays(self.metadata.space, jacobian, d, length)
+
+    def render_view(self, camera: Camera, cam_from_object: np.ndarray) -> RenderedView:
+        """See RayRenderer."""
+        return tile_view(self.render_rays, camera, cam_from_object)
+
+    def _trace(self, o: torch.Tensor, d: torch.Tensor):  # noqa: ANN202
+        jitter = torch.full((len(o),), 0.5, device=o.device)
+        with torch.no_grad():
+            samples = self._twin.march(o, d, jitter)
+        background = torch.tensor(self.metadata.background, dtype=torch.float32, device=o.device)
+        return self._twin(o, d, background, samples)
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(array, device=self._twin.device)

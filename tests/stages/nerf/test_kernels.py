@@ -1,0 +1,136 @@
+"""The compiled kernels against the plain twin, in values and gradients, on random fields."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.nerf.config import FieldConfig
+from stages.nerf.field import Field, domain_of, new_net
+from stages.nerf.kernels.train import Gradients, train
+from stages.nerf.metadata import FieldMetadata, Space
+from stages.nerf.renderer import NumbaRenderer
+from stages.nerf.torch_renderer import TorchRenderer
+from stages.nerf.twin import distortion_loss, twin_of
+from stages.nerf.workers import Workers
+
+BOX = Space(False, (0.1, -0.2, 0.3), 1.5, half=(1.0, 0.8, 0.9), step=0.03)
+BALL = Space(True, (0.1, -0.2, 0.3), 1.5, near=0.05, far=20.0, step=0.06)
+CONFIGS = {
+    "wide": FieldConfig(levels=3, level_features=4, log2_table=9, finest_resolution=64, hidden=16, features=6,
+                        colour_hidden=8, occupancy_resolution=16),
+    "narrow": FieldConfig(levels=5, level_features=2, log2_table=8, base_resolution=4, finest_resolution=50, hidden=8,
+                          features=3, colour_hidden=16, occupancy_resolution=8),
+}  # fmt: skip
+
+
+def random_field(config: FieldConfig, space: Space, fill: float, seed: int) -> Field:
+    rng = np.random.default_rng(seed)
+    net = new_net(config, rng)
+    net.table[:] = rng.normal(0, 0.7, net.table.shape)
+    n = config.occupancy_resolution
+    metadata = FieldMetadata(space, config, (1.0, 0.5, 0.0), [], "test", "")
+    return Field(metadata, net, rng.random((n, n, n)) < fill)
+
+
+def random_rays(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Some hit the middle, some miss, some start inside, some run along an axis."""
+    rng = np.random.default_rng(seed)
+    origins = rng.normal(0, 2.5, (count, 3)).astype(np.float32)
+    directions = (rng.normal(0, 0.7, (count, 3)) - origins).astype(np.float32)
+    directions[: count // 8] *= -1
+    directions[-1] = (0, 0, 2)
+    return origins, directions
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    config=st.sampled_from(sorted(CONFIGS)), space=st.sampled_from([BOX, BALL]),
+    fill=st.sampled_from([0.0, 0.02, 0.3, 1.0]), seed=st.integers(0, 1000),
+)  # fmt: skip
+def test_renders_as_the_twin(config: str, space: Space, fill: float, seed: int) -> None:
+    field = random_field(CONFIGS[config], space, fill, seed)
+    origins, directions = random_rays(65, seed)
+    fast = NumbaRenderer(field, threads=2, stop_below=0.0).render_rays(origins, directions)
+    slow = TorchRenderer(field).render_rays(origins, directions)
+    agree(fast.rgb, slow.rgb, 2e-3)
+    agree(fast.opacity, slow.opacity, 2e-3)
+    solid = slow.opacity > 0.05
+    agree(fast.depth[solid], slow.depth[solid], 5e-3)
+
+
+def agree(a: np.ndarray, b: np.ndarray, tolerance: float) -> None:
+    """Equal but for the rare ray with a sample on the border of two cells, which rounding puts in either."""
+    assert np.all(np.isfinite(a))
+    assert np.all(np.isfinite(b))
+    error = np.abs(a - b)
+    while error.ndim > 1:
+        error = error.max(axis=1)
+    assert np.sum(error > tolerance) <= 0.06 * len(a), np.sort(error)[-8:]
+
+
+@pytest.mark.parametrize("space", [BOX, BALL])
+def test_early_stop_costs_no_more_than_its_limit(space: Space) -> None:
+    field = random_field(CONFIGS["wide"], space, 0.5, 3)
+    origins, directions = random_rays(64, 3)
+    full = NumbaRenderer(field, stop_below=0.0).render_rays(origins, directions)
+    stopped = NumbaRenderer(field, stop_below=0.01).render_rays(origins, directions)
+    assert np.abs(full.opacity - stopped.opacity).max() <= 0.0101
+
+
+@pytest.mark.parametrize("space", [BOX, BALL])
+@pytest.mark.parametrize("name", sorted(CONFIGS))
+def test_jacobian_as_the_twin(space: Space, name: str) -> None:
+    field = random_field(CONFIGS[name], space, 0.4, 5)
+    origins, directions = random_rays(40, 5)
+    weights = np.array([[1, 0, 0], [0.3, 0.5, 0.2]], np.float32)
+    fast, by_fast = NumbaRenderer(field, threads=2).render_rays_jacobian(origins, directions, weights)
+    slow, by_slow = TorchRenderer(field).render_rays_jacobian(origins, directions, weights)
+    assert by_fast.shape == (40, 2, 6)
+    agree(fast.rgb, slow.rgb, 5e-3)
+    agree(by_fast, by_slow, 0.03 * float(np.abs(by_slow).max()))
+    assert np.corrcoef(by_fast.ravel(), by_slow.ravel())[0, 1] > 0.98
+
+
+@pytest.mark.parametrize("space", [BOX, BALL])
+@pytest.mark.parametrize("name", sorted(CONFIGS))
+def test_training_gradients_as_the_twin(space: Space, name: str) -> None:
+    field = random_field(CONFIGS[name], space, 0.4, 7)
+    rng = np.random.default_rng(7)
+    origins, directions = random_rays(48, 7)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    background, target = rng.random((2, 48, 3), dtype=np.float32)
+    jitter = rng.random(48, dtype=np.float32)
+    workers = Workers(CONFIGS[name], 1, 32, 8192, backward=True)
+    grads = Gradients(*(np.zeros_like(getattr(field.net, n)) for n in Gradients._fields))
+    delta, distortion, scale = 0.1, 0.02, 1 / 48
+    scratch = workers.scratch[0]
+    squared, _ = train(
+        field.net, field.domain(), origins, directions, jitter, background, target, 0, 48, 8, 0.0,
+        np.float32(delta), np.float32(distortion), np.float32(scale), scratch.samples, scratch.rays, grads,
+    )  # fmt: skip
+    twin = twin_of(field)
+    o, d, b = (torch.tensor(a) for a in (origins, directions, background))
+    samples = twin.march(o, d, torch.tensor(jitter))
+    rays = twin(o, d, b, samples)
+    error = rays.rgb - torch.tensor(target)
+    loss = torch.nn.functional.huber_loss(rays.rgb, torch.tensor(target), reduction="sum", delta=delta) * scale
+    loss = loss + distortion * scale * distortion_loss(samples, rays.weights, space.contracted)
+    loss.backward()
+    assert squared == pytest.approx(float((error**2).sum()), rel=0.02)
+    for n in Gradients._fields:
+        fast, slow = getattr(grads, n).ravel(), getattr(twin, n).grad.numpy().ravel()
+        assert np.linalg.norm(fast - slow) < 0.03 * np.linalg.norm(slow), n
+
+
+def test_the_packed_domain_keeps_every_occupied_cell() -> None:
+    occupied = np.random.default_rng(0).random((16, 16, 16)) < 0.01
+    domain = domain_of(BOX, occupied)
+    z, y, x = np.nonzero(occupied)
+    flat = x + 16 * (y + 16 * z)
+    assert np.all(domain.bits[flat >> 3] >> (flat & 7) & 1)
+    assert int(np.unpackbits(domain.bits).sum()) == occupied.sum()
+    assert np.all(domain.coarse[(x // 8) + 2 * ((y // 8) + 2 * (z // 8))] == 1)

@@ -106,7 +106,7 @@ def _sphere(
     length2 = (direction * direction).sum(1)
     nearest = (to_centre * direction).sum(1) / length2
     miss = torch.linalg.norm(to_centre - nearest[:, None] * direction, dim=1)
-    half_chord = torch.sqrt(torch.nn.functional.softplus((radius**2 - miss**2) * 200) / 200 / length2)
+    half_chord = torch.sqrt(torch.nn.functional.softplus((radius**2 - miss**2) * 200) / 200 / length2 + 1e-12)
     return nearest - half_chord, torch.sigmoid((radius - miss) / softness) * (nearest > 0)
 
 

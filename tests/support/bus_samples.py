@@ -5,11 +5,26 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+
 from bus import topics
 from bus.messages import (
-    CameraModel, Correspondences, Estimate, Frame, Guess, GuessReason, Header, Matches, Message, Pose, Reason, State,
-    Stats, TrackingState, Truth, View,
-)  # fmt: skip
+    CameraModel,
+    Correspondences,
+    Estimate,
+    Frame,
+    Guess,
+    GuessReason,
+    Header,
+    Matches,
+    Message,
+    Pose,
+    Reason,
+    State,
+    Stats,
+    TrackingState,
+    Truth,
+    View,
+)
 from bus.ports import first_header
 from bus.topics import Address, Topic
 
@@ -28,7 +43,9 @@ def scores(count: int) -> np.ndarray:
 def frame(frame_id: int = 0, width: int = 6, height: int = 4, header: Header | None = None) -> Frame:
     image = np.random.default_rng(frame_id).integers(0, 256, (height, width, 3), dtype=np.uint8)
     camera = CameraModel(width, height, 5.0, 5.0, 2.5, 1.5)
-    return Frame(header=header or first_header(frame_id, 1000 + frame_id), image=image, encoding="rgb8", camera=camera)
+    return Frame(
+        header=header or first_header(frame_id, 1000 + frame_id), image=image, encoding="rgb8", camera=camera
+    )
 
 
 def truth(frame_id: int = 0) -> Truth:
@@ -91,7 +108,14 @@ def every_message() -> dict[Topic, Message]:
             **result, **pose, camera=CAMERA, inliers_in_frame=pixels(3), correspondences=5, residual_px=0.5
         ),
         topics.POSE: Pose(
-            **result, **pose, inliers=3, correspondences=5, residual_px=0.5, refined=True, loss_before=2.0, loss_after=1.0
+            **result,
+            **pose,
+            inliers=3,
+            correspondences=5,
+            residual_px=0.5,
+            refined=True,
+            loss_before=2.0,
+            loss_after=1.0,
         ),
         topics.STATE: State(
             header=header,

@@ -1,0 +1,36 @@
+"""Settings of the refinement stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """How a pose is refined by colours (the paper's section III-C)."""
+
+    steps: int = 40
+    """at most so many steps; 0 turns refinement off"""
+    optimiser: Literal["lm", "adam"] = "lm"
+    """lm: Levenberg-Marquardt on one sample of pixels; adam: the paper's, on a new sample in each step"""
+    region: Literal["keypoints", "image"] = "keypoints"
+    """where pixels are taken from: around the matched keypoints, or anywhere (wrong where something is in front)"""
+    dilations: int = 3
+    """n: how often the keypoints are dilated by 5 x 5 pixels"""
+    samples: int = 768
+    """pixels in each step"""
+    held_out: int = 512
+    """pixels that decide whether the refined pose is the better one; no step sees them"""
+    size: int = 400
+    """longer side in pixels to which the frame is shrunk"""
+    colours: Literal["grey", "rgb"] = "grey"
+    """compare grey values or the three channels, at three times the cost of derivatives"""
+    background: Literal["ignore", "compare"] = "ignore"
+    """ignore: where the field is transparent a pixel counts for nothing; compare: the frame has the field's own"""
+    outlier: float = 0.1
+    """colour differences (0..1) well beyond it are something else than the object, and hardly pull"""
+    learning_rate: float = 3e-3
+    """Adam's, in radians and in shares of the distance to the surface"""
+    converged: float = 2e-5
+    """a step that is smaller, in the same unit, is the last"""

@@ -1,0 +1,91 @@
+"""Refining a pose by colours, around the matched keypoints only: what hides the object has no keypoints on it.
+
+The paper's section III-C (keypoint-guided occlusion-robust refinement).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from stages.geometry import Camera
+from stages.nerf.rendering_api import RayRenderer
+from stages.refinement.config import RefinementConfig
+from stages.refinement.optimisers import adam, levenberg_marquardt
+from stages.refinement.photometric import Photometric, keypoint_region
+
+__all__ = ["RefinementConfig", "RefinementResult", "refine"]
+
+_MIN_PIXELS = 64
+
+
+@dataclass(frozen=True)
+class RefinementResult:
+    """The better of the pose before and after, and the held-out loss of both (None where nothing was tried).
+
+    Losses are robust, of colour differences in 0..1, on the same pixels with the same weights.
+    """
+
+    cam_from_object: np.ndarray
+    refined: bool
+    loss_before: float | None
+    loss_after: float | None
+    steps: int
+
+
+def refine(
+    renderer: RayRenderer,
+    image: np.ndarray,
+    camera: Camera,
+    cam_from_object: np.ndarray,
+    keypoints_in_frame: np.ndarray,
+    rng: np.random.Generator,
+    config: RefinementConfig | None = None,
+) -> RefinementResult:
+    """Refine the pose of a frame (h, w, 3) uint8 whose matched keypoints are given, (n, 2) pixels.
+
+    Returns the pose unchanged, `refined` false, where the refined one is no better or there is nothing to compare.
+    """
+    config = config or RefinementConfig()
+    unchanged = RefinementResult(cam_from_object, False, None, None, 0)
+    if config.steps == 0:
+        return unchanged
+    image, camera, keypoints = _shrunk(image, camera, keypoints_in_frame, config.size)
+    pixels = rng.permutation(_candidates(keypoints, camera, config))
+    held_out = min(config.held_out, len(pixels) // 3)
+    if held_out < _MIN_PIXELS:
+        return unchanged
+    photometric = Photometric(renderer, config.colours == "rgb", config.outlier)
+    judge = photometric.sample(image, camera, pixels[:held_out])
+    opaque, distance = photometric.weighted_by_opacity(judge, cam_from_object)
+    if distance == 0:
+        return unchanged
+    judge = opaque if config.background == "ignore" else judge
+    before = photometric.loss(judge, cam_from_object)
+    pool = photometric.sample(image, camera, pixels[held_out:])
+    optimise = levenberg_marquardt if config.optimiser == "lm" else adam
+    refined, steps = optimise(photometric, pool, cam_from_object, distance, rng, config)
+    after = photometric.loss(judge, refined)
+    better = after < before
+    return RefinementResult(refined if better else cam_from_object, better, before, after, steps)
+
+
+def _shrunk(
+    image: np.ndarray, camera: Camera, keypoints: np.ndarray, size: int
+) -> tuple[np.ndarray, Camera, np.ndarray]:
+    factor = size / max(camera.width, camera.height)
+    if factor >= 1:
+        return image, camera, keypoints
+    small = camera.scaled(factor)
+    image = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    scale = np.array([small.width / camera.width, small.height / camera.height])
+    return image, small, (keypoints + 0.5) * scale - 0.5
+
+
+def _candidates(keypoints: np.ndarray, camera: Camera, config: RefinementConfig) -> np.ndarray:
+    if config.region == "image":
+        return camera.grid()
+    y, x = keypoint_region(keypoints, camera, config.dilations).nonzero()
+    return np.stack([x, y], axis=1).astype(np.float32)

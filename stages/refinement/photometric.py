@@ -1,0 +1,109 @@
+"""Colour differences between a frame and the field, and their derivative by the pose.
+
+The loss of a difference r is c^2 r^2 / (c^2 + r^2) / 2, which what hides the object cannot raise beyond c^2 / 2.
+Source: Geman and McClure, Statistical methods for tomographic image reconstruction (1987).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from stages.geometry import Camera
+from stages.nerf.rendering_api import RayRenderer, RenderedRays
+
+_SHARPNESS = 8
+"""Silhouettes pull by what lies behind them; a power of the opacity takes even thinly mixed pixels out."""
+_GREY = np.array([[0.299, 0.587, 0.114]], np.float32)
+
+
+@dataclass(frozen=True)
+class PixelSample:
+    """Pixels of a frame: directions (n, 3) float32 in the camera, z = 1; colours (n, k) in 0..1; weights (n,)."""
+
+    directions: np.ndarray
+    colours: np.ndarray
+    weights: np.ndarray
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """loss at a pose, and Gauss-Newton's gradient (6,) and Hessian (6, 6) of it by the left twist."""
+
+    loss: float
+    gradient: np.ndarray
+    hessian: np.ndarray
+
+
+class Photometric:
+    """The loss of the differences between samples of a frame and the field rendered at a pose."""
+
+    def __init__(self, renderer: RayRenderer, rgb: bool, outlier: float) -> None:
+        self._renderer, self._scale2 = renderer, outlier**2
+        self._channels = np.eye(3, dtype=np.float32) if rgb else _GREY
+
+    def sample(self, image: np.ndarray, camera: Camera, pixels: np.ndarray) -> PixelSample:
+        """The colours of whole pixels (n, 2) of an image (h, w, 3) uint8; all count the same."""
+        x, y = pixels.astype(int).T
+        colours = image[y, x].astype(np.float32) / 255 @ self._channels.T
+        return PixelSample(camera.directions(pixels), colours, np.ones(len(pixels), np.float32))
+
+    def weighted_by_opacity(self, sample: PixelSample, cam_from_object: np.ndarray) -> tuple[PixelSample, float]:
+        """The sample with weights that tell surface from background at a pose, and the median depth (0: no hit)."""
+        rendered = self._renderer.render_rays(*_rays(sample, cam_from_object))
+        hit = rendered.depth[rendered.opacity > 0.5]
+        return replace(sample, weights=rendered.opacity**_SHARPNESS), float(np.median(hit)) if len(hit) else 0.0
+
+    def loss(self, sample: PixelSample, cam_from_object: np.ndarray) -> float:
+        """The weighted mean loss at a pose."""
+        rendered = self._renderer.render_rays(*_rays(sample, cam_from_object))
+        return self._mean(*self._compare(sample, rendered))
+
+    def linearise(self, sample: PixelSample, cam_from_object: np.ndarray) -> Linearised:
+        """The loss at a pose and its derivatives by the left twist."""
+        origins, directions = _rays(sample, cam_from_object)
+        rendered, by_ray = self._renderer.render_rays_jacobian(origins, directions, self._channels)
+        jacobian = _by_twist(by_ray, sample.directions, cam_from_object)
+        residuals, weights = self._compare(sample, rendered)
+        pull = weights * (self._scale2 / (self._scale2 + residuals**2)) ** 2 / max(weights.sum(), 1e-12)
+        flat = jacobian.reshape(-1, 6).astype(np.float64)
+        pulled = pull.reshape(-1, 1) * flat
+        return Linearised(self._mean(residuals, weights), pulled.T @ residuals.ravel(), pulled.T @ flat)
+
+    def _compare(self, sample: PixelSample, rendered: RenderedRays) -> tuple[np.ndarray, np.ndarray]:
+        residuals = (rendered.rgb @ self._channels.T - sample.colours).astype(np.float64)
+        return residuals, np.broadcast_to(sample.weights[:, None], residuals.shape).astype(np.float64)
+
+    def _mean(self, residuals: np.ndarray, weights: np.ndarray) -> float:
+        squared = residuals**2
+        loss = self._scale2 * squared / (self._scale2 + squared) / 2
+        return float((weights * loss).sum() / max(weights.sum(), 1e-12))
+
+
+def keypoint_region(keypoints: np.ndarray, camera: Camera, dilations: int) -> np.ndarray:
+    """Mask (h, w) bool of the keypoints (n, 2), dilated `dilations` times by 5 x 5 pixels."""
+    mask = np.zeros((camera.height, camera.width), np.uint8)
+    x, y = np.rint(keypoints).astype(int).T
+    inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+    mask[y[inside], x[inside]] = 1
+    return cv2.dilate(mask, np.ones((5, 5), np.uint8), iterations=dilations).astype(bool) if dilations else mask > 0
+
+
+def _rays(sample: PixelSample, cam_from_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    rotation = cam_from_object[:3, :3]
+    origin = (-rotation.T @ cam_from_object[:3, 3]).astype(np.float32)
+    directions = sample.directions @ rotation.astype(np.float32)
+    return np.repeat(origin[None], len(directions), axis=0), directions
+
+
+def _by_twist(by_ray: np.ndarray, directions: np.ndarray, cam_from_object: np.ndarray) -> np.ndarray:
+    """From derivatives (n, k, 6) by origin and direction in the object to those by the left twist.
+
+    A twist (rho, phi) moves the origin by -R^T rho and turns the direction d in the camera to d + d x phi.
+    """
+    object_to_cam = cam_from_object[:3, :3].T.astype(np.float32)
+    by_shift = -by_ray[..., :3] @ object_to_cam
+    by_turn = np.cross(by_ray[..., 3:] @ object_to_cam, directions[:, None])
+    return np.concatenate([by_shift, by_turn], axis=-1)

@@ -1,0 +1,21 @@
+"""Settings of the rendering stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class RenderingConfig:
+    """How large views are, and when an old one is near enough to be used again."""
+
+    size: int = 400
+    """longer side of a view in pixels; never more than the frame's"""
+    min_visible: float = 0.002
+    """a view whose pixels show the object to a smaller share is reported as a failure"""
+    reuse_angle_deg: float = 1.0
+    """a cached view is used again if surface points are seen from directions that differ by no more; 0: never"""
+    reuse_shift: float = 0.02
+    """and if they are shifted by no more than this share of the image's longer side (root mean square)"""
+    cache_mb: float = 64.0
+    """memory for cached views; the longest unused ones are forgotten"""

@@ -1,0 +1,117 @@
+"""Rendering the field where the camera is guessed to be, or finding a view from near there that exists already."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import numpy as np
+
+from stages.geometry import Camera, camera_centre, rays
+from stages.nerf.rendering_api import RayRenderer, RenderedView
+from stages.rendering.config import RenderingConfig
+
+__all__ = ["RenderingConfig", "SourcedView", "ViewSource", "view_camera"]
+
+_PROBES = 256
+
+
+@dataclass(frozen=True)
+class SourcedView:
+    """A view, its id, whether it was rendered for an earlier guess, and the share of pixels that show the object."""
+
+    view: RenderedView
+    view_id: str
+    reused: bool
+    visible: float
+
+
+class ViewSource:
+    """Views of one field. `field_id` tells its views from another field's."""
+
+    def __init__(self, renderer: RayRenderer, config: RenderingConfig | None = None, field_id: str = "") -> None:
+        self._renderer, self._config, self._field_id = renderer, config or RenderingConfig(), field_id
+        self._cache: OrderedDict[str, _Cached] = OrderedDict()
+
+    def view(self, camera: Camera, cam_from_object: np.ndarray) -> SourcedView:
+        """The view of a frame's camera (distortion left out, shrunk) at the guess or near it; see RenderingConfig."""
+        small = view_camera(camera, self._config.size)
+        found = self._near(small, cam_from_object)
+        if found is not None:
+            self._cache.move_to_end(found)
+            cached = self._cache[found]
+            return SourcedView(cached.view, found, True, cached.visible)
+        view = self._renderer.render_view(small, cam_from_object)
+        view_id = _view_id(self._field_id, small, cam_from_object)
+        cached = _Cached(view, float((view.opacity > 0.5).mean()), _probes(view))
+        self._keep(view_id, cached)
+        return SourcedView(view, view_id, False, cached.visible)
+
+    def _near(self, camera: Camera, cam_from_object: np.ndarray) -> str | None:
+        """The id of the cached view with the smallest shift among those near enough."""
+        if self._config.reuse_angle_deg <= 0:
+            return None
+        best, best_shift = None, self._config.reuse_shift
+        for view_id, cached in self._cache.items():
+            if cached.view.camera == camera:
+                angle_deg, shift = _difference(cached, cam_from_object)
+                if angle_deg <= self._config.reuse_angle_deg and shift <= best_shift:
+                    best, best_shift = view_id, shift
+        return best
+
+    def _keep(self, view_id: str, cached: _Cached) -> None:
+        if self._config.reuse_angle_deg <= 0:
+            return
+        self._cache[view_id] = cached
+        while sum(entry.size_bytes for entry in self._cache.values()) > self._config.cache_mb * 2**20:
+            self._cache.popitem(last=False)
+
+
+def view_camera(camera: Camera, size: int) -> Camera:
+    """The camera without distortion, its longer side at most `size` pixels."""
+    return camera.undistorted().scaled(min(1.0, size / max(camera.width, camera.height)))
+
+
+@dataclass(frozen=True)
+class _Cached:
+    """A view, its visible share, and surface points in it: (n, 3) in object coordinates, float64."""
+
+    view: RenderedView
+    visible: float
+    probes: np.ndarray
+
+    @property
+    def size_bytes(self) -> int:
+        view = self.view
+        return view.rgb.nbytes + view.depth.nbytes + view.opacity.nbytes + self.probes.nbytes
+
+
+def _probes(view: RenderedView) -> np.ndarray:
+    surface = np.flatnonzero((view.opacity > 0.5) & (view.depth > 0))
+    chosen = surface[np.linspace(0, len(surface) - 1, min(_PROBES, len(surface))).astype(int)]
+    y, x = np.divmod(chosen, view.camera.width)
+    origins, directions = rays(view.camera, view.cam_from_object, np.stack([x, y], axis=1))
+    return (origins + view.depth.ravel()[chosen, None] * directions).astype(np.float64)
+
+
+def _difference(cached: _Cached, cam_from_object: np.ndarray) -> tuple[float, float]:
+    """Between a cached view and a guess: the median angle in degrees between the directions in which surface points
+
+    are seen, and the root mean square shift of their pixels as a share of the longer side. Infinite if none is left.
+    """
+    camera, old = cached.view.camera, cached.view.cam_from_object
+    now = camera.project(cached.probes @ cam_from_object[:3, :3].T + cam_from_object[:3, 3])
+    before = camera.project(cached.probes @ old[:3, :3].T + old[:3, 3])
+    if len(now) == 0 or not np.isfinite(now).all():
+        return np.inf, np.inf
+    shift = np.sqrt(((now - before) ** 2).sum(axis=1).mean()) / max(camera.width, camera.height)
+    first, second = cached.probes - camera_centre(old), cached.probes - camera_centre(cam_from_object)
+    cosine = (first * second).sum(axis=1) / np.linalg.norm(first, axis=1) / np.linalg.norm(second, axis=1)
+    return float(np.rad2deg(np.median(np.arccos(np.clip(cosine, -1, 1))))), float(shift)
+
+
+def _view_id(field_id: str, camera: Camera, cam_from_object: np.ndarray) -> str:
+    digest = hashlib.sha256(f"{field_id} {camera}".encode())
+    digest.update(np.ascontiguousarray(cam_from_object, dtype="<f8").tobytes())
+    return digest.hexdigest()[:16]

@@ -19,7 +19,7 @@ _PROBES = 256
 
 @dataclass(frozen=True)
 class SourcedView:
-    """A view, its id, whether it was rendered for an earlier guess, and the share of pixels that show the object."""
+    """A view, its id, whether it was rendered for an earlier guess, and the share of pixels that show something."""
 
     view: RenderedView
     view_id: str
@@ -35,7 +35,7 @@ class ViewSource:
         self._cache: OrderedDict[str, _Cached] = OrderedDict()
 
     def view(self, camera: Camera, cam_from_object: np.ndarray) -> SourcedView:
-        """The view of a frame's camera (distortion left out, shrunk) at the guess or near it; see RenderingConfig."""
+        """The view of a frame's camera (distortion left out, shrunk) at the guess or near it."""
         small = view_camera(camera, self._config.size)
         found = self._near(small, cam_from_object)
         if found is not None:
@@ -96,9 +96,10 @@ def _probes(view: RenderedView) -> np.ndarray:
 
 
 def _difference(cached: _Cached, cam_from_object: np.ndarray) -> tuple[float, float]:
-    """Between a cached view and a guess: the median angle in degrees between the directions in which surface points
+    """How differently a guess sees the surface points of a cached view; infinite if it has none of them in front.
 
-    are seen, and the root mean square shift of their pixels as a share of the longer side. Infinite if none is left.
+    The median angle in degrees between the directions in which they are seen, and the root mean square shift of
+    their pixels as a share of the longer side.
     """
     camera, old = cached.view.camera, cached.view.cam_from_object
     now = camera.project(cached.probes @ cam_from_object[:3, :3].T + cam_from_object[:3, 3])

@@ -1,0 +1,1 @@
+"""Where frames come from, and when each of them is sent."""

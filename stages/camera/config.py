@@ -1,0 +1,47 @@
+"""Settings of the camera stage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from stages.errors import ConfigError
+
+Pace = Literal["auto", "live", "lockstep", "fast"]
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """A source, its calibration, and the pace at which its frames are sent."""
+
+    source: str
+    """folder:DIR, dataset:DIR:test, video:FILE, camera:0 or mcap:FILE."""
+    size: int | None = None
+    """Shrink images whose longer side has more pixels than this."""
+    holdout: Literal["auto", "odd", "every8"] = "auto"
+    """Which images of a dataset without splits of its own are the test images."""
+    camera_file: Path | None = None
+    """JSON with width, height, fx, fy, cx, cy and distortion (k1 k2 p1 p2 k3) of a folder's, video's or device's
+    images; without it the focal length is taken from the image's EXIF, or from fov_deg."""
+    fov_deg: float = 60.0
+    """Field of view along the longer side, where nothing better is known."""
+    pace: Pace = "auto"
+    """live: by the source's own times; lockstep: a frame when the one before has been answered; fast: at once;
+    auto: live for what has times of its own, lockstep for photos."""
+    rate_hz: float | None = None
+    """Frames a second instead of the source's own times."""
+    frames: int | None = None
+    """Stop after so many."""
+    answer_timeout_s: float = 15.0
+    """Without a sign of life of a frame for so long, lockstep goes on and the end of the source is the end."""
+    progress_file: Path | None = None
+    """Notes which frame comes next, so that a camera that is started again goes on there."""
+
+    def __post_init__(self) -> None:
+        for name in ("size", "rate_hz", "frames", "answer_timeout_s"):
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ConfigError(f"camera: {name} is {value}, but must be more than 0")
+        if not 1.0 <= self.fov_deg <= 170.0:
+            raise ConfigError(f"camera: fov_deg is {self.fov_deg}, but must lie between 1 and 170 degrees")

@@ -1,0 +1,154 @@
+"""Frames as their sources give them, and the feed that says when each is due; the time is always an argument."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from stages.camera.config import CameraConfig, Pace
+from stages.errors import ConfigError
+from stages.geometry import Camera
+
+_BURST = 8
+_DEFAULT_RATE_HZ = 30.0
+Clock = Literal["none", "own", "wall"]
+
+
+@dataclass(frozen=True)
+class TruePose:
+    """What a source knows of a frame's pose: cam_from_object (4, 4), None where the object is out of view."""
+
+    cam_from_object: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class CapturedFrame:
+    """An image (height, width, 3) uint8 RGB, or the bytes (n,) of a jpeg or png file.
+
+    at_ns is its time by the source's clock; None where the source has none.
+    """
+
+    frame_id: int
+    image: np.ndarray
+    encoding: Literal["rgb8", "jpeg", "png"]
+    camera: Camera
+    name: str
+    at_ns: int | None = None
+    truth: TruePose | None = None
+
+
+@dataclass(frozen=True)
+class Source:
+    """`frames(first)` reads from the frame at that place on; it raises StageError where one cannot be read.
+
+    clock: "own" for frames with times since some moment of their own, "wall" since the epoch, as they are taken.
+    """
+
+    description: str
+    clock: Clock
+    frames: Callable[[int], Iterator[CapturedFrame]]
+    length: int | None = None
+
+    def pace(self, wanted: Pace) -> Pace:
+        """The pace to send at. ConfigError for a device that is to wait."""
+        if self.clock == "wall" and wanted == "lockstep":
+            raise ConfigError("camera: a device does not wait for answers; choose pace live or fast")
+        if wanted != "auto":
+            return wanted
+        return "lockstep" if self.clock == "none" else "live"
+
+
+class Feed:
+    """Gives each frame when it is due, and knows when all have been answered."""
+
+    def __init__(self, source: Source, config: CameraConfig, first: int = 0) -> None:
+        self._pace = source.pace(config.pace)
+        self._clock = source.clock
+        self._rate_hz = config.rate_hz
+        self._timeout_ns = int(config.answer_timeout_s * 1e9)
+        self._left = None if config.frames is None else config.frames - first
+        self._frames = source.frames(first)
+        self._next: CapturedFrame | None = None
+        self._exhausted = False
+        self._start: tuple[int, int] | None = None
+        self._sent = 0
+        self._awaited: int | None = None
+        self._in_flight = 0
+        self._last_sign_ns = 0
+        self.unanswered = 0
+
+    def due(self, now_ns: int) -> list[tuple[CapturedFrame, int]]:
+        """Frames to send now, each with its capture time since the epoch; a device is waited for."""
+        sent: list[tuple[CapturedFrame, int]] = []
+        while len(sent) < (1 if self._clock == "wall" else _BURST) and self._may_send(now_ns):
+            frame = self._peek()
+            if frame is None:
+                break
+            capture_ns = self._capture_ns(frame, now_ns)
+            if self._pace == "live" and self._clock != "wall" and capture_ns > now_ns:
+                break
+            sent.append((frame, capture_ns))
+            self._note_sent(frame, now_ns)
+        return sent
+
+    def sign_of_life(self, frame_id: int, now_ns: int) -> None:
+        """A pass over that frame has come back."""
+        if frame_id == self._awaited:
+            self._last_sign_ns = now_ns
+
+    def answered(self, frame_id: int, in_flight: int, now_ns: int) -> None:
+        """Tracking is done with that frame, and has `in_flight` others left."""
+        self.sign_of_life(frame_id, now_ns)
+        self._in_flight = in_flight
+        if frame_id == self._awaited:
+            self._awaited = None
+
+    def over(self, now_ns: int) -> bool:
+        """Whether the source has ended, and the last frame is answered or will not be."""
+        if not self._exhausted:
+            return False
+        return (self._awaited is None and self._in_flight == 0) or self._silent(now_ns)
+
+    def close(self) -> None:
+        """Let go of the source's files and devices."""
+        close = getattr(self._frames, "close", None)
+        if close is not None:
+            close()
+
+    def _may_send(self, now_ns: int) -> bool:
+        if self._pace != "lockstep" or self._awaited is None:
+            return True
+        if self._peek() is None or not self._silent(now_ns):
+            return False
+        self.unanswered += 1
+        return True
+
+    def _silent(self, now_ns: int) -> bool:
+        return now_ns - self._last_sign_ns > self._timeout_ns
+
+    def _peek(self) -> CapturedFrame | None:
+        if self._next is None and not self._exhausted:
+            self._next = next(self._frames, None) if self._left is None or self._sent < self._left else None
+            self._exhausted = self._next is None
+        return self._next
+
+    def _capture_ns(self, frame: CapturedFrame, now_ns: int) -> int:
+        if self._clock == "wall" and frame.at_ns is not None:
+            return frame.at_ns
+        rate_hz = self._rate_hz
+        if self._clock == "none" and self._pace == "live":
+            rate_hz = rate_hz or _DEFAULT_RATE_HZ
+        if rate_hz is None and frame.at_ns is None:
+            return now_ns
+        at_ns = frame.at_ns if rate_hz is None else round(self._sent * 1e9 / rate_hz)
+        self._start = self._start or (now_ns, at_ns or 0)
+        return self._start[0] + (at_ns or 0) - self._start[1]
+
+    def _note_sent(self, frame: CapturedFrame, now_ns: int) -> None:
+        self._next = None
+        self._sent += 1
+        self._awaited = frame.frame_id
+        self._last_sign_ns = now_ns

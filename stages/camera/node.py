@@ -1,0 +1,55 @@
+"""The camera as a process: frames out, each when it is due; what tracking says about them in."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+
+from bus.logs import stage_logger
+from bus.messages import Message
+from bus.node import EndOfInput, Output
+from bus.topics import FRAME, POSE, STATE, TRUTH, Topic
+from stages.camera.config import CameraConfig
+from stages.camera.sender import Sender
+
+
+class CameraNode:
+    """A Handler that ends by itself, once the last frame of its source is answered.
+
+    `wait_until_ready` is called before the first frame, for instance to wait for the stages that will work on it.
+    Raises StageErrors at start, and at stop the one that ended the source early.
+    """
+
+    name = "camera"
+    inputs: tuple[Topic, ...] = (STATE, POSE)
+    outputs: tuple[Topic, ...] = (FRAME, TRUTH)
+
+    def __init__(self, config: CameraConfig, wait_until_ready: Callable[[], None] = lambda: None) -> None:
+        self._config = config
+        self._wait_until_ready = wait_until_ready
+        self._sender: Sender | None = None
+
+    def start(self) -> None:
+        self._sender = Sender(self._config)
+        stage_logger(self.name).info("source", what=self._sender.description)
+        self._wait_until_ready()
+
+    def handle(self, topic: Topic, message: Message) -> Iterable[Output]:
+        now_ns = time.time_ns()
+        self._opened.heard(message, now_ns)
+        return self.tick(now_ns)  # or an answer would wait up to 20 ms for the next frame
+
+    def tick(self, now_ns: int) -> Iterator[Output]:
+        yield from self._opened.messages(now_ns)
+        if self._opened.over(now_ns):
+            raise EndOfInput
+
+    def stop(self) -> None:
+        if self._sender is not None:
+            self._sender.close()
+
+    @property
+    def _opened(self) -> Sender:
+        if self._sender is None:
+            raise RuntimeError("the camera was not started")
+        return self._sender

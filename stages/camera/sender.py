@@ -1,0 +1,53 @@
+"""A source on its way: its frames as messages, each when it is due, and a note of how far it has got."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from bus.messages import Message, State
+from bus.node import Output
+from stages.camera.config import CameraConfig
+from stages.camera.core import Feed
+from stages.camera.progress import Progress
+from stages.camera.sources import open_source
+from stages.camera.wire import messages_of
+from stages.errors import SourceError, StageError
+
+
+class Sender:
+    """Sends config.source, from where its progress file says. Raises StageErrors where it cannot be opened."""
+
+    def __init__(self, config: CameraConfig) -> None:
+        source = open_source(config)
+        self.description = source.description
+        self._progress = Progress(config.progress_file, config.source)
+        self._feed = Feed(source, config, self._progress.next)
+        self._error: StageError | None = None
+
+    def messages(self, now_ns: int) -> Iterator[Output]:
+        """What is to be sent now; progress is noted after each frame."""
+        try:
+            due = self._feed.due(now_ns)
+        except (StageError, OSError) as error:
+            self._error = error if isinstance(error, StageError) else SourceError(str(error))
+            return
+        for frame, capture_ns in due:
+            yield from messages_of(frame, capture_ns)
+            self._progress.advance()
+
+    def heard(self, message: Message, now_ns: int) -> None:
+        """Take in a State or a Pose: a frame is answered, or a pass over it has come back."""
+        if isinstance(message, State):
+            self._feed.answered(message.header.frame_id, message.in_flight, now_ns)
+        else:
+            self._feed.sign_of_life(message.header.frame_id, now_ns)
+
+    def over(self, now_ns: int) -> bool:
+        """Whether nothing more will come: all is sent and answered, or the source cannot be read on."""
+        return self._error is not None or self._feed.over(now_ns)
+
+    def close(self) -> None:
+        """Let go of the source. Raises the StageError that ended it early, if one did."""
+        self._feed.close()
+        if self._error is not None:
+            raise self._error

@@ -1,0 +1,51 @@
+"""The kinds of sources, one file each; a new kind is a file with an `open_…` function and a row in KINDS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from stages.camera.config import CameraConfig
+from stages.camera.core import Source
+from stages.camera.sources.dataset import open_dataset
+from stages.camera.sources.device import open_device
+from stages.camera.sources.folder import open_folder
+from stages.camera.sources.recording import open_recording
+from stages.camera.sources.video import open_video
+from stages.errors import SourceError
+
+
+class Kind(NamedTuple):
+    """How to open a source, given what stands after the colon; is_video: its frames follow one another in time."""
+
+    open: Callable[[str, CameraConfig], Source]
+    example: str
+    is_video: bool
+
+
+KINDS: dict[str, Kind] = {
+    "folder": Kind(open_folder, "folder:DIR", False),
+    "dataset": Kind(open_dataset, "dataset:DIR:test", False),
+    "video": Kind(open_video, "video:FILE", True),
+    "camera": Kind(open_device, "camera:0", True),
+    "mcap": Kind(open_recording, "mcap:FILE", True),
+}
+
+
+def open_source(config: CameraConfig) -> Source:
+    """Open config.source. Raises SourceError or another StageError, in one line."""
+    kind, rest = _parse(config.source)
+    return kind.open(rest, config)
+
+
+def is_video(source: str) -> bool:
+    """Whether motion between the frames of such a source may be relied upon. Raises SourceError."""
+    return _parse(source)[0].is_video
+
+
+def _parse(source: str) -> tuple[Kind, str]:
+    name, _, rest = source.partition(":")
+    if name not in KINDS or not rest:
+        examples = ", ".join(kind.example for kind in KINDS.values())
+        raise SourceError(f"source {source!r}: expected one of {examples}")
+    return KINDS[name], rest

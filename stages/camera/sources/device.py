@@ -1,0 +1,54 @@
+"""A camera that is plugged in, through OpenCV; a frame's time is when it was taken."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import cv2
+
+from stages.camera.calibration import calibrate, shrunk
+from stages.camera.config import CameraConfig
+from stages.camera.core import CapturedFrame, Source
+from stages.errors import SourceError
+from stages.geometry import Camera
+
+
+def open_device(rest: str, config: CameraConfig) -> Source:
+    """camera:NUMBER or camera:PATH of a device. Raises SourceError if it cannot be opened or gives no frame."""
+    with _capture(rest) as capture:
+        read, image = capture.read()
+        if not read:
+            raise SourceError(f"camera:{rest}: opened, but gives no frame; does another program use it?")
+    calibration = calibrate(config, image.shape[1], image.shape[0])
+
+    def frames(first: int) -> Iterator[CapturedFrame]:
+        return _frames(rest, first, calibration.camera, config.size)
+
+    return Source(f"camera {rest}, {calibration.origin}", "wall", frames)
+
+
+def _frames(device: str, frame_id: int, camera: Camera, size: int | None) -> Iterator[CapturedFrame]:
+    with _capture(device) as capture:
+        while capture.grab():
+            at_ns = time.time_ns()
+            read, bgr = capture.retrieve()
+            if not read or bgr.shape[:2] != (camera.height, camera.width):
+                raise SourceError(f"camera:{device}: gave a frame that cannot be read, or of another size")
+            image, resized = shrunk(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
+            yield CapturedFrame(frame_id, image, "rgb8", resized, f"camera{device}#{frame_id}", at_ns)
+            frame_id += 1
+
+
+@contextmanager
+def _capture(device: str) -> Iterator[cv2.VideoCapture]:
+    capture = cv2.VideoCapture(int(device) if device.isdecimal() else device)
+    try:
+        if not capture.isOpened():
+            raise SourceError(f"camera:{device}: no such camera, or no right to use it; see /dev/video*")
+        # Else a driver's queue hands out frames that are several periods old.
+        capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+        yield capture
+    finally:
+        capture.release()

@@ -1,0 +1,69 @@
+"""A folder of images, in natural order of their names."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from stages.camera.calibration import calibrate, shrunk
+from stages.camera.config import CameraConfig
+from stages.camera.core import CapturedFrame, Source
+from stages.errors import DatasetError, SourceError
+from stages.nerf.datasets.images import EXTENSIONS, load_pixels, over_background, probe
+
+_ORIENTATION = 0x0112
+
+
+def open_folder(rest: str, config: CameraConfig) -> Source:
+    """folder:DIR. Raises SourceError for a missing or empty folder, and for a file that is no image."""
+    root = Path(rest)
+    if not root.is_dir():
+        raise SourceError(f"{root}: no such folder of images")
+    paths = sorted((path for path in root.iterdir() if path.suffix.lower() in EXTENSIONS), key=natural)
+    if not paths:
+        raise SourceError(f"{root}: no images in this folder; expected {', '.join(EXTENSIONS)}")
+    origin = calibrate(config, *_size(paths[0]), paths[0]).origin
+
+    def frames(first: int) -> Iterator[CapturedFrame]:
+        for i, path in enumerate(paths[first:], first):
+            yield _read(i, path, config)
+
+    return Source(f"{len(paths)} images of {root}, {origin}", "none", frames, len(paths))
+
+
+def natural(path: Path) -> list[tuple[int, str]]:
+    """Sort key by which frame2 comes before frame10."""
+    parts = re.split(r"(\d+)", path.name.lower())
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
+
+
+def _read(frame_id: int, path: Path, config: CameraConfig) -> CapturedFrame:
+    width, height = _size(path)
+    camera = calibrate(config, width, height, path).camera
+    if _can_stay_encoded(path) and (config.size is None or max(width, height) <= config.size):
+        encoded = np.frombuffer(path.read_bytes(), np.uint8)
+        return CapturedFrame(frame_id, encoded, "jpeg", camera, path.name)
+    try:
+        pixels = over_background(load_pixels(path, width, height, probe(path).has_alpha), "white")
+    except DatasetError as error:
+        raise SourceError(str(error)) from error
+    image, camera = shrunk(pixels, camera, config.size)
+    return CapturedFrame(frame_id, image, "rgb8", camera, path.name)
+
+
+def _size(path: Path) -> tuple[int, int]:
+    try:
+        header = probe(path)
+    except DatasetError as error:
+        raise SourceError(str(error)) from error
+    return header.width, header.height
+
+
+def _can_stay_encoded(path: Path) -> bool:
+    """An RGB JPEG that no decoder turns: EXIF orientation is ignored here, as it is in datasets."""
+    with Image.open(path) as image:
+        return image.format == "JPEG" and image.mode == "RGB" and image.getexif().get(_ORIENTATION, 1) == 1

@@ -1,0 +1,88 @@
+"""The camera frames of a recording, with the frame numbers, times and true poses that were recorded."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Iterator
+from itertools import islice
+from typing import cast
+
+import cv2
+import msgspec
+import numpy as np
+
+from bus.errors import RecordingError
+from bus.messages import Frame, Truth
+from bus.replay import Recorded, read_recording
+from bus.topics import FRAME, TRUTH
+from stages.camera.calibration import shrunk
+from stages.camera.config import CameraConfig
+from stages.camera.core import CapturedFrame, Source, TruePose
+from stages.errors import SourceError
+from stages.geometry import Camera
+
+_TRUTH_MAY_LAG = 4
+_TRUTHS_KEPT = 64
+
+
+def open_recording(rest: str, config: CameraConfig) -> Source:
+    """mcap:FILE. Raises SourceError for a file that cannot be read, without frames, or with several cameras."""
+
+    def frames(first: int) -> Iterator[CapturedFrame]:
+        return islice(_frames(rest, config.size), first, None)
+
+    if next(frames(0), None) is None:
+        raise SourceError(f"{rest}: no camera frames in this recording; `fieldpose info` lists what it has")
+    return Source(f"recording {rest}", "own", frames)
+
+
+def _frames(path: str, size: int | None) -> Iterator[CapturedFrame]:
+    for frame, truth in _with_truths(path):
+        camera = Camera(**msgspec.structs.asdict(frame.camera))
+        header = frame.header
+        known = None if truth is None else TruePose(truth.cam_from_object)
+        image, encoding = frame.image, frame.encoding
+        if size is not None and max(camera.width, camera.height) > size:
+            image, camera = shrunk(_decoded(frame, path), camera, size)
+            encoding = "rgb8"
+        name = f"frame {header.frame_id}"
+        yield CapturedFrame(header.frame_id, image, encoding, camera, name, header.capture_ns, known)
+
+
+def _with_truths(path: str) -> Iterator[tuple[Frame, Truth | None]]:
+    """Each frame with its truth, which may stand a little before or after it in the file."""
+    waiting: deque[Frame] = deque()
+    truths: OrderedDict[int, Truth] = OrderedDict()
+    for recorded in _messages(path):
+        if recorded.topic is TRUTH:
+            truths[recorded.message.header.frame_id] = cast(Truth, recorded.message)
+            if len(truths) > _TRUTHS_KEPT:
+                truths.popitem(last=False)
+        else:
+            waiting.append(cast(Frame, recorded.message))
+        while waiting and (waiting[0].header.frame_id in truths or len(waiting) > _TRUTH_MAY_LAG):
+            frame = waiting.popleft()
+            yield frame, truths.pop(frame.header.frame_id, None)
+    for frame in waiting:
+        yield frame, truths.pop(frame.header.frame_id, None)
+
+
+def _messages(path: str) -> Iterator[Recorded]:
+    keys: dict[str, str] = {}
+    try:
+        for recorded in read_recording(path, (FRAME, TRUTH)):
+            if keys.setdefault(recorded.topic.name, recorded.key) != recorded.key:
+                both = f"{keys[recorded.topic.name]} and {recorded.key}"
+                raise SourceError(f"{path}: holds {both}; a source is one camera and one object")
+            yield recorded
+    except RecordingError as error:
+        raise SourceError(str(error)) from error
+
+
+def _decoded(frame: Frame, path: str) -> np.ndarray:
+    if frame.encoding == "rgb8":
+        return frame.image
+    bgr = cv2.imdecode(frame.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if bgr is None or bgr.shape[:2] != (frame.camera.height, frame.camera.width):
+        raise SourceError(f"{path}: the {frame.encoding} image of frame {frame.header.frame_id} cannot be read")
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)

@@ -1,0 +1,71 @@
+"""A video file, through OpenCV; its frames come with the file's own times."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+
+from stages.camera.calibration import calibrate, shrunk
+from stages.camera.config import CameraConfig
+from stages.camera.core import CapturedFrame, Source
+from stages.errors import SourceError
+from stages.geometry import Camera
+
+_QUIET = "-8"
+_FALLBACK_FPS = 30.0
+
+
+def open_video(rest: str, config: CameraConfig) -> Source:
+    """video:FILE. Raises SourceError for a file that is missing, or from which no frame can be read."""
+    path = Path(rest)
+    with _capture(path) as capture:
+        read, image = capture.read()
+        if not read:
+            raise SourceError(
+                f"{path}: no frame of this video can be read; convert it, for instance to H.264 in .mp4"
+            )
+        fps, length = capture.get(cv2.CAP_PROP_FPS), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    calibration = calibrate(config, image.shape[1], image.shape[0])
+    fps = fps if 0 < fps < 1000 else _FALLBACK_FPS
+
+    def frames(first: int) -> Iterator[CapturedFrame]:
+        return _frames(path, first, calibration.camera, fps, config.size)
+
+    return Source(
+        f"video {path}, {fps:.4g} frames a second, {calibration.origin}", "own", frames, max(length, 0) or None
+    )
+
+
+def _frames(path: Path, first: int, camera: Camera, fps: float, size: int | None) -> Iterator[CapturedFrame]:
+    at_ms, index = -1000 / fps, 0
+    with _capture(path) as capture:
+        while capture.grab():
+            stated = capture.get(cv2.CAP_PROP_POS_MSEC)
+            at_ms = stated if stated > at_ms else at_ms + 1000 / fps
+            if index >= first:
+                read, bgr = capture.retrieve()
+                if not read or bgr.shape[:2] != (camera.height, camera.width):
+                    raise SourceError(f"{path}: frame {index} cannot be read, or is not of the first one's size")
+                image, resized = shrunk(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
+                yield CapturedFrame(index, image, "rgb8", resized, f"{path.name}#{index}", round(at_ms * 1e6))
+            index += 1
+
+
+@contextmanager
+def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
+    if not path.is_file():
+        raise SourceError(f"{path}: no such video file")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _QUIET)
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        if not capture.isOpened():
+            raise SourceError(
+                f"{path}: not a video that OpenCV can open; convert it, for instance to H.264 in .mp4"
+            )
+        yield capture
+    finally:
+        capture.release()

@@ -1,0 +1,26 @@
+"""From captured frames to the messages on the bus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+
+import numpy as np
+
+from bus.messages import CameraModel, Frame, Truth
+from bus.node import Output, first_header
+from bus.topics import FRAME, TRUTH
+from stages.camera.core import CapturedFrame
+
+
+def messages_of(frame: CapturedFrame, capture_ns: int) -> Iterator[Output]:
+    """What is known of the frame's pose, where anything is, and then the frame."""
+    header = first_header(frame.frame_id, capture_ns)
+    if frame.truth is not None:
+        known = frame.truth.cam_from_object
+        yield TRUTH, Truth(header=header, cam_from_object=None if known is None else np.array(known, np.float64))
+    camera = CameraModel(**asdict(frame.camera))
+    yield (
+        FRAME,
+        Frame(header=header, image=np.ascontiguousarray(frame.image), encoding=frame.encoding, camera=camera),
+    )

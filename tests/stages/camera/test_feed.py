@@ -1,0 +1,148 @@
+"""When each frame is sent: by its own time, by the answers, or at once; and when all is over."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stages.camera.config import CameraConfig
+from stages.camera.core import CapturedFrame, Clock, Feed, Source
+from stages.camera.progress import Progress
+from stages.errors import ConfigError
+from stages.geometry import Camera
+
+MS = 1_000_000
+START = 1_700_000_000_000 * MS
+TIMES_MS = (500, 533, 567, 700, 733)
+
+
+def source(clock: Clock, count: int = 5) -> Source:
+    def frames(first: int) -> Iterator[CapturedFrame]:
+        for i in range(first, count):
+            at_ns = None if clock == "none" else (START if clock == "wall" else 0) + TIMES_MS[i % 5] * MS
+            yield CapturedFrame(
+                i, np.zeros((2, 2, 3), np.uint8), "rgb8", Camera(2, 2, 1.0, 1.0, 0.5, 0.5), str(i), at_ns
+            )
+
+    return Source("test", clock, frames, count)
+
+
+def feed(clock: Clock, count: int = 5, first: int = 0, **config: object) -> Feed:
+    return Feed(source(clock, count), CameraConfig("folder:x", **config), first)  # type: ignore[arg-type]
+
+
+def sent(feed: Feed, at_ms: float) -> list[tuple[int, float]]:
+    """(frame_id, capture time in ms since START) of what is sent at that time."""
+    return [(f.frame_id, (ns - START) / MS) for f, ns in feed.due(START + int(at_ms * MS))]
+
+
+def test_live_frames_go_when_their_own_times_say_so() -> None:
+    live = feed("own")
+    assert sent(live, 0) == [(0, 0)]
+    assert sent(live, 32) == []
+    assert sent(live, 70) == [(1, 33), (2, 67)]
+    assert sent(live, 199) == []
+    assert sent(live, 1000) == [(3, 200), (4, 233)]
+
+
+def test_a_rate_replaces_the_times() -> None:
+    assert [sent(feed_, 0) + sent(feed_, 99) + sent(feed_, 100) for feed_ in [feed("own", rate_hz=10)]] == [
+        [(0, 0), (1, 100)]
+    ]
+    photos = feed("none", pace="live", rate_hz=4)
+    assert sent(photos, 0) + sent(photos, 249) + sent(photos, 250) == [(0, 0), (1, 250)]
+
+
+def test_photos_go_in_lockstep_with_the_answers_and_the_time_of_sending() -> None:
+    photos = feed("none", count=3)
+    assert sent(photos, 0) == [(0, 0)]
+    assert sent(photos, 5000) == []
+    photos.answered(0, 0, START + 6000 * MS)
+    assert sent(photos, 6000) == [(1, 6000)]
+    photos.answered(0, 0, START + 6100 * MS)
+    assert sent(photos, 6200) == []
+
+
+def test_a_video_in_lockstep_keeps_its_own_times() -> None:
+    video = feed("own", pace="lockstep")
+    captured = []
+    for i in range(5):
+        captured += sent(video, 1000 * i)
+        video.answered(i, 0, START + 1000 * i * MS)
+    assert captured == [(0, 0), (1, 33), (2, 67), (3, 200), (4, 233)]
+
+
+def test_lockstep_goes_on_without_an_answer_once_there_is_no_sign_of_life() -> None:
+    photos = feed("none", answer_timeout_s=1.0)
+    assert sent(photos, 0) == [(0, 0)]
+    photos.sign_of_life(0, START + 900 * MS)
+    assert sent(photos, 1800) == []
+    assert sent(photos, 1901) == [(1, 1901)]
+    assert photos.unanswered == 1
+
+
+def test_fast_sends_all_in_a_few_ticks() -> None:
+    fast = feed("none", count=20, pace="fast")
+    assert [len(sent(fast, i)) for i in range(4)] == [8, 8, 4, 0]
+
+
+def test_a_device_sets_the_pace_and_the_times() -> None:
+    device = feed("wall")
+    assert sent(device, 0) == [(0, 500)]
+    assert sent(device, 1) == [(1, 533)]
+    with pytest.raises(ConfigError, match="does not wait"):
+        feed("wall", pace="lockstep")
+
+
+def test_it_is_over_when_the_last_frame_is_answered_and_none_is_in_flight() -> None:
+    last = feed("none", count=2)
+    for i in range(2):
+        assert sent(last, 10 * i) == [(i, 10 * i)]
+        assert not last.over(START + 10 * MS)
+        last.answered(i, 1, START + 10 * i * MS)
+    assert sent(last, 20) == []
+    assert not last.over(START + 20 * MS)
+    last.answered(0, 0, START + 20 * MS)
+    assert last.over(START + 20 * MS)
+
+
+def test_it_is_over_after_a_while_when_nobody_answers() -> None:
+    alone = feed("own", answer_timeout_s=2.0)
+    sent(alone, 0)
+    sent(alone, 1000)
+    assert sent(alone, 1001) == []
+    assert not alone.over(START + 2999 * MS)
+    assert alone.over(START + 3001 * MS)
+
+
+def test_no_more_frames_than_asked_for_even_after_a_restart() -> None:
+    few = feed("none", pace="fast", frames=3)
+    assert [i for i, _ in sent(few, 0)] == [0, 1, 2]
+    rest = feed("none", pace="fast", frames=3, first=2)
+    assert [i for i, _ in sent(rest, 0)] == [2]
+
+
+def test_a_restarted_source_goes_on_at_once_where_it_was() -> None:
+    assert sent(feed("own", first=3), 0) == [(3, 0)]
+
+
+def test_progress_survives_and_belongs_to_its_source(tmp_path: Path) -> None:
+    path = tmp_path / "progress.json"
+    progress = Progress(path, "video:a")
+    for _ in range(3):
+        progress.advance()
+    assert Progress(path, "video:a").next == 3
+    assert Progress(path, "video:b").next == 0
+    path.write_text("{")
+    assert Progress(path, "video:a").next == 0
+    assert Progress(None, "video:a").next == 0
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("wrong", [{"size": 0}, {"rate_hz": -1.0}, {"frames": 0}, {"fov_deg": 180.0}])
+def test_settings_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        CameraConfig("folder:x", **wrong)  # type: ignore[arg-type]

@@ -1,0 +1,306 @@
+"""Sources read from real files: what comes out, in what order, with which camera and when."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from support.posed_images import CAMERA, write_blender, write_transforms
+
+from bus.messages import CameraModel, Frame, Truth
+from bus.node import first_header
+from bus.recorder import RecordingWriter
+from bus.topics import FRAME, TRUTH, Address
+from stages.camera.config import CameraConfig
+from stages.camera.core import CapturedFrame
+from stages.camera.sources import KINDS, is_video, open_source
+from stages.errors import DatasetError, SourceError
+from stages.geometry import Camera, look_at
+
+MS = 1_000_000
+
+
+def frames_of(source: object, first: int = 0, **config: object) -> list[CapturedFrame]:
+    return list(open_source(CameraConfig(str(source), **config)).frames(first))  # type: ignore[arg-type]
+
+
+def shade(value: int, width: int = 48, height: int = 32) -> np.ndarray:
+    """A picture whose red tells its number, brighter to the right."""
+    image = np.zeros((height, width, 3), np.uint8)
+    image[..., 0] = value
+    image[..., 1] = np.linspace(0, 255, width).astype(np.uint8)
+    return image
+
+
+def decoded(frame: CapturedFrame) -> np.ndarray:
+    if frame.encoding == "rgb8":
+        return frame.image
+    return cv2.cvtColor(cv2.imdecode(frame.image, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    root = tmp_path / "photos"
+    root.mkdir()
+    for name, value in (("img10.png", 100), ("img2.jpg", 20), ("img1.png", 10)):
+        Image.fromarray(shade(value)).save(root / name, quality=95)
+    (root / "notes.txt").write_text("no image")
+    return root
+
+
+def test_a_folder_comes_in_natural_order_and_jpegs_stay_as_they_are(folder: Path) -> None:
+    frames = frames_of(f"folder:{folder}")
+    assert [frame.name for frame in frames] == ["img1.png", "img2.jpg", "img10.png"]
+    assert [frame.encoding for frame in frames] == ["rgb8", "jpeg", "rgb8"]
+    assert frames[1].image.tobytes() == (folder / "img2.jpg").read_bytes()
+    for frame, value in zip(frames, (10, 20, 100), strict=True):
+        assert decoded(frame)[..., 0].mean() == pytest.approx(value, abs=3)
+        assert decoded(frame).shape == (frame.camera.height, frame.camera.width, 3)
+    assert [frame.frame_id for frame in frames_of(f"folder:{folder}", first=1)] == [1, 2]
+
+
+def test_images_are_shrunk_with_their_camera(folder: Path) -> None:
+    full, small = frames_of(f"folder:{folder}")[1], frames_of(f"folder:{folder}", size=24)[1]
+    assert (small.encoding, small.image.shape) == ("rgb8", (16, 24, 3))
+    assert (small.camera.width, small.camera.height) == (24, 16)
+    assert small.camera.fx == pytest.approx(full.camera.fx / 2)
+    assert small.camera.cx == pytest.approx((full.camera.cx + 0.5) / 2 - 0.5)
+
+
+def test_transparency_is_laid_over_white(tmp_path: Path) -> None:
+    clear = np.zeros((8, 8, 4), np.uint8)
+    Image.fromarray(clear).save(tmp_path / "clear.png")
+    assert frames_of(f"folder:{tmp_path}")[0].image.min() == 255
+
+
+def with_exif(path: Path, tag: int, value: int, ifd: int | None = None) -> None:
+    exif = Image.Exif()
+    (exif if ifd is None else exif.get_ifd(ifd))[tag] = value
+    Image.fromarray(shade(5)).save(path, exif=exif)
+
+
+def test_a_turned_jpeg_is_decoded_without_turning_it(tmp_path: Path) -> None:
+    with_exif(tmp_path / "turned.jpg", 0x0112, 6)
+    frame = frames_of(f"folder:{tmp_path}")[0]
+    assert (frame.encoding, frame.image.shape) == ("rgb8", (32, 48, 3))
+
+
+def test_the_focal_length_comes_from_exif_then_from_the_field_of_view(tmp_path: Path) -> None:
+    with_exif(tmp_path / "a.jpg", 0xA405, 26, ifd=0x8769)
+    source = open_source(CameraConfig(f"folder:{tmp_path}", fov_deg=90))
+    assert "EXIF" in source.description
+    assert next(source.frames(0)).camera.fx == pytest.approx(26 * np.hypot(48, 32) / np.hypot(36, 24))
+    Image.fromarray(shade(5)).save(tmp_path / "a.jpg")
+    source = open_source(CameraConfig(f"folder:{tmp_path}", fov_deg=90))
+    assert "90 degrees" in source.description
+    camera = next(source.frames(0)).camera
+    assert (camera.fx, camera.fy) == (pytest.approx(24.0), pytest.approx(24.0))
+    assert (camera.cx, camera.cy) == (23.5, 15.5)
+
+
+def camera_file(path: Path, **changes: object) -> Path:
+    known = {
+        "width": 96,
+        "height": 64,
+        "fx": 100,
+        "fy": 101,
+        "cx": 47.5,
+        "cy": 31.5,
+        "distortion": [0.1, 0, 0, 0, 0],
+    }
+    path.write_text(json.dumps({name: value for name, value in (known | changes).items() if value is not None}))
+    return path
+
+
+def test_a_camera_file_overrides_and_is_scaled_to_the_images(folder: Path, tmp_path: Path) -> None:
+    frame = frames_of(f"folder:{folder}", camera_file=camera_file(tmp_path / "camera.json"))[0]
+    assert frame.camera == Camera(48, 32, 50.0, 50.5, 23.5, 15.5, (0.1, 0, 0, 0, 0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"fx": None}, "fx"),
+        ({"fx": -1}, "positive"),
+        ({"focal": 3}, "focal"),
+        ({"distortion": [1]}, "distortion"),
+        ({"width": 64}, "another shape"),
+    ],
+)
+def test_a_bad_camera_file_is_named(folder: Path, tmp_path: Path, changes: dict, complaint: str) -> None:
+    path = camera_file(tmp_path / "camera.json", **changes)
+    with pytest.raises(SourceError, match=complaint) as caught:
+        frames_of(f"folder:{folder}", camera_file=path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(SourceError, match="no such camera file"):
+        frames_of(f"folder:{folder}", camera_file=tmp_path / "none.json")
+
+
+def test_a_dataset_split_comes_with_its_true_poses(tmp_path: Path) -> None:
+    poses = write_blender(tmp_path, CAMERA.resized(64, 64), counts=(4, 2))
+    frames = frames_of(f"dataset:{tmp_path}:test")
+    assert len(frames) == 2
+    for frame, pose in zip(frames, poses[4:], strict=True):
+        assert frame.truth is not None
+        np.testing.assert_allclose(frame.truth.cam_from_object, pose, atol=1e-6)
+        assert (frame.encoding, frame.image.shape) == ("rgb8", (64, 64, 3))
+        assert frame.image[0, 0].min() == 255
+    assert [frame.name for frame in frames_of(f"dataset:{tmp_path}")] == [frame.name for frame in frames]
+    assert len(frames_of(f"dataset:{tmp_path}:all", size=32)) == 6
+
+
+def test_size_and_holdout_reach_the_dataset(tmp_path: Path) -> None:
+    write_transforms(tmp_path, CAMERA, count=9)
+    assert [frame.name for frame in frames_of(f"dataset:{tmp_path}:test", holdout="every8")] == [
+        "images/0000.png",
+        "images/0008.png",
+    ]
+    frame = frames_of(f"dataset:{tmp_path}:test", size=48)[0]
+    assert (frame.camera.width, frame.image.shape) == (48, (32, 48, 3))
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("video") / "clip.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 25.0, (48, 32))
+    for i in range(10):
+        writer.write(cv2.cvtColor(shade(20 * i), cv2.COLOR_RGB2BGR))
+    writer.release()
+    return path
+
+
+def test_a_video_comes_with_the_times_of_its_frames(video: Path) -> None:
+    source = open_source(CameraConfig(f"video:{video}"))
+    frames = list(source.frames(0))
+    assert (source.clock, source.length, len(frames)) == ("own", 10, 10)
+    assert "25 frames a second" in source.description
+    times = np.array([frame.at_ns for frame in frames]) / MS
+    np.testing.assert_allclose(np.diff(times), 40, atol=1)
+    for i, frame in enumerate(frames):
+        assert frame.image[..., 0].mean() == pytest.approx(20 * i, abs=8)
+        assert frame.image[..., 2].mean() < 40
+    assert [frame.at_ns for frame in source.frames(7)] == [frame.at_ns for frame in frames[7:]]
+
+
+def test_a_device_is_read_with_the_time_of_day(video: Path) -> None:
+    source = open_source(CameraConfig(f"camera:{video}"))
+    frames = list(source.frames(5))
+    assert source.clock == "wall"
+    assert [frame.frame_id for frame in frames[:2]] == [5, 6]
+    assert frames[0].at_ns is not None
+    assert frames[0].at_ns > 1.6e18
+
+
+def record(path: Path, order: list[tuple[str, int]], camera: str = "camera0", encoding: str = "rgb8") -> Path:
+    writer = RecordingWriter(path)
+    address = Address(camera=camera)
+    for i, (kind, frame_id) in enumerate(order):
+        header = first_header(frame_id, 5_000 * MS + frame_id * 33 * MS)
+        if kind == "truth":
+            pose = look_at((4, 0.1 * frame_id, 1), (0, 0, 0), (0, 0, 1)) if frame_id % 5 else None
+            writer.write(address.key(TRUTH), TRUTH, Truth(header=header, cam_from_object=pose), i)
+            continue
+        image = shade(frame_id)
+        if encoding == "jpeg":
+            image = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
+        model = CameraModel(48, 32, 50.0, 50.0, 23.5, 15.5)
+        frame = Frame(header=header, image=image, encoding=encoding, camera=model)  # type: ignore[arg-type]
+        writer.write(address.key(FRAME), FRAME, frame, i)
+    writer.close()
+    return path
+
+
+def test_a_recording_comes_with_its_numbers_times_and_truths(tmp_path: Path) -> None:
+    order = [("truth", 3), ("frame", 3), ("frame", 4), ("truth", 4), ("frame", 5), ("frame", 7), ("truth", 5)]
+    frames = frames_of(f"mcap:{record(tmp_path / 'a.mcap', order)}")
+    assert [frame.frame_id for frame in frames] == [3, 4, 5, 7]
+    times = np.array([frame.at_ns for frame in frames])
+    np.testing.assert_array_equal(np.diff(times), [33 * MS, 33 * MS, 66 * MS])
+    assert [frame.truth is not None for frame in frames] == [True, True, True, False]
+    assert frames[0].truth.cam_from_object is not None  # type: ignore[union-attr]
+    assert frames[2].truth.cam_from_object is None  # type: ignore[union-attr]
+    np.testing.assert_array_equal(frames[3].image, shade(7))
+    assert [f.frame_id for f in frames_of(f"mcap:{tmp_path / 'a.mcap'}", first=2)] == [5, 7]
+
+
+def test_recorded_images_stay_encoded_unless_they_are_shrunk(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", [("frame", 60)], encoding="jpeg")
+    assert frames_of(f"mcap:{path}")[0].encoding == "jpeg"
+    small = frames_of(f"mcap:{path}", size=24)[0]
+    assert (small.encoding, small.image.shape, small.camera.fx) == ("rgb8", (16, 24, 3), 25.0)
+    assert small.image[..., 0].mean() == pytest.approx(60, abs=4)
+
+
+def test_a_recording_of_two_cameras_is_not_mixed(tmp_path: Path) -> None:
+    path = record(tmp_path / "one.mcap", [("frame", 0)])
+    writer = RecordingWriter(tmp_path / "two.mcap")
+    for i, camera in enumerate(("left", "right")):
+        model = CameraModel(48, 32, 50.0, 50.0, 23.5, 15.5)
+        frame = Frame(header=first_header(i, i), image=shade(0), encoding="rgb8", camera=model)
+        writer.write(Address(camera=camera).key(FRAME), FRAME, frame, i)
+    writer.close()
+    assert len(frames_of(f"mcap:{path}")) == 1
+    with pytest.raises(SourceError, match="one camera"):
+        frames_of(f"mcap:{tmp_path / 'two.mcap'}")
+
+
+def broken_sources(root: Path) -> dict[str, tuple[str, str]]:
+    (root / "empty").mkdir()
+    (root / "words").mkdir()
+    (root / "words" / "a.png").write_text("no image at all")
+    (root / "text.mp4").write_text("no video at all")
+    (root / "text.mcap").write_text("no recording at all")
+    RecordingWriter(root / "silent.mcap").close()
+    return {
+        "unknown kind": ("webcam:0", "folder:DIR, dataset:DIR:test, video:FILE, camera:0, mcap:FILE"),
+        "no kind": ("photos", "expected one of"),
+        "nothing after the colon": ("folder:", "expected one of"),
+        "missing folder": (f"folder:{root / 'none'}", "no such folder"),
+        "empty folder": (f"folder:{root / 'empty'}", "no images"),
+        "not an image": (f"folder:{root / 'words'}", "a.png"),
+        "missing video": (f"video:{root / 'none.mp4'}", "no such video"),
+        "not a video": (f"video:{root / 'text.mp4'}", "text.mp4: not a video"),
+        "no such device": ("camera:987", "no such camera"),
+        "missing recording": (f"mcap:{root / 'none.mcap'}", "none.mcap"),
+        "not a recording": (f"mcap:{root / 'text.mcap'}", "no recording"),
+        "recording without frames": (f"mcap:{root / 'silent.mcap'}", "no camera frames"),
+        "unknown split": (f"dataset:{root}:tests", "no split"),
+    }
+
+
+def test_what_cannot_be_opened_is_told_in_one_line(tmp_path: Path) -> None:
+    for what, (source, complaint) in broken_sources(tmp_path).items():
+        with pytest.raises(SourceError) as caught:
+            open_source(CameraConfig(source))
+        assert complaint in str(caught.value), what
+        assert "\n" not in str(caught.value), what
+
+
+def test_a_dataset_that_is_none_is_an_error_of_the_dataset(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="no such folder"):
+        open_source(CameraConfig(f"dataset:{tmp_path / 'none'}:test"))
+
+
+def test_which_sources_are_videos() -> None:
+    assert {name for name, kind in KINDS.items() if kind.is_video} == {"video", "camera", "mcap"}
+    assert is_video("mcap:a.mcap")
+    assert not is_video("folder:photos")
+
+
+@pytest.mark.skipif(
+    not (Path(__file__).parents[3].parent / "shared" / "data" / "fox").is_dir(), reason="no photographs here"
+)
+def test_real_photographs_as_a_dataset_and_as_a_folder() -> None:
+    fox = Path(__file__).parents[3].parent / "shared" / "data" / "fox"
+    source = open_source(CameraConfig(f"dataset:{fox}:test", size=320))
+    frame = next(source.frames(3))
+    assert source.length == 25
+    assert max(frame.image.shape) == 320
+    assert any(frame.camera.distortion)
+    loose = next(open_source(CameraConfig(f"folder:{fox / 'images'}")).frames(0))
+    assert loose.encoding == "jpeg"

@@ -80,19 +80,20 @@ class Feed:
         self._last_sign_ns = 0
         self.unanswered = 0
 
-    def due(self, now_ns: int) -> list[tuple[CapturedFrame, int]]:
-        """Frames to send now, each with its capture time since the epoch; a device is waited for."""
-        sent: list[tuple[CapturedFrame, int]] = []
-        while len(sent) < (1 if self._clock == "wall" else _BURST) and self._may_send(now_ns):
-            frame = self._peek()
+    def due(self, now_ns: int) -> Iterator[tuple[CapturedFrame, int]]:
+        """Frames to send now, each with its capture time since the epoch; a device is waited for.
+
+        Raises what the source raises where it cannot be read on.
+        """
+        for _ in range(1 if self._clock == "wall" else _BURST):
+            frame = self._peek() if self._may_send(now_ns) else None
             if frame is None:
-                break
+                return
             capture_ns = self._capture_ns(frame, now_ns)
             if self._pace == "live" and self._clock != "wall" and capture_ns > now_ns:
-                break
-            sent.append((frame, capture_ns))
+                return
             self._note_sent(frame, now_ns)
-        return sent
+            yield frame, capture_ns
 
     def sign_of_life(self, frame_id: int, now_ns: int) -> None:
         """A pass over that frame has come back."""

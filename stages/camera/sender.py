@@ -27,13 +27,11 @@ class Sender:
     def messages(self, now_ns: int) -> Iterator[Output]:
         """What is to be sent now; progress is noted after each frame."""
         try:
-            due = self._feed.due(now_ns)
+            for frame, capture_ns in self._feed.due(now_ns):
+                yield from messages_of(frame, capture_ns)
+                self._progress.advance()
         except (StageError, OSError) as error:
             self._error = error if isinstance(error, StageError) else SourceError(str(error))
-            return
-        for frame, capture_ns in due:
-            yield from messages_of(frame, capture_ns)
-            self._progress.advance()
 
     def heard(self, message: Message, now_ns: int) -> None:
         """Take in a State or a Pose: a frame is answered, or a pass over it has come back."""

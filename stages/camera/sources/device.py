@@ -11,6 +11,7 @@ import cv2
 from stages.camera.calibration import calibrate, shrunk
 from stages.camera.config import CameraConfig
 from stages.camera.core import CapturedFrame, Source
+from stages.camera.sources.capture import opened
 from stages.errors import SourceError
 from stages.geometry import Camera
 
@@ -43,12 +44,8 @@ def _frames(device: str, frame_id: int, camera: Camera, size: int | None) -> Ite
 
 @contextmanager
 def _capture(device: str) -> Iterator[cv2.VideoCapture]:
-    capture = cv2.VideoCapture(int(device) if device.isdecimal() else device)
-    try:
-        if not capture.isOpened():
-            raise SourceError(f"camera:{device}: no such camera, or no right to use it; see /dev/video*")
+    complaint = f"camera:{device}: no such camera, or no right to use it; see /dev/video*"
+    with opened(int(device) if device.isdecimal() else device, complaint) as capture:
         # Else a driver's queue hands out frames that are several periods old.
         capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         yield capture
-    finally:
-        capture.release()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 import cv2
@@ -12,10 +11,10 @@ import cv2
 from stages.camera.calibration import calibrate, shrunk
 from stages.camera.config import CameraConfig
 from stages.camera.core import CapturedFrame, Source
+from stages.camera.sources.capture import opened
 from stages.errors import SourceError
 from stages.geometry import Camera
 
-_QUIET = "-8"
 _FALLBACK_FPS = 30.0
 
 
@@ -55,17 +54,8 @@ def _frames(path: Path, first: int, camera: Camera, fps: float, size: int | None
             index += 1
 
 
-@contextmanager
-def _capture(path: Path) -> Iterator[cv2.VideoCapture]:
+def _capture(path: Path) -> AbstractContextManager[cv2.VideoCapture]:
     if not path.is_file():
         raise SourceError(f"{path}: no such video file")
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", _QUIET)
-    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    try:
-        if not capture.isOpened():
-            raise SourceError(
-                f"{path}: not a video that OpenCV can open; convert it, for instance to H.264 in .mp4"
-            )
-        yield capture
-    finally:
-        capture.release()
+    complaint = f"{path}: not a video that OpenCV can open; convert it, for instance to H.264 in .mp4"
+    return opened(str(path), complaint, cv2.CAP_FFMPEG)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -279,6 +281,24 @@ def test_what_cannot_be_opened_is_told_in_one_line(tmp_path: Path) -> None:
             open_source(CameraConfig(source))
         assert complaint in str(caught.value), what
         assert "\n" not in str(caught.value), what
+
+
+def test_libraries_print_nothing_about_what_cannot_be_opened(tmp_path: Path) -> None:
+    broken_sources(tmp_path)
+    program = """
+import sys
+from stages.camera.config import CameraConfig
+from stages.camera.sources import open_source
+from stages.errors import SourceError
+for source in sys.argv[1:]:
+    try:
+        open_source(CameraConfig(source))
+    except SourceError:
+        print("refused")
+"""
+    command = [sys.executable, "-c", program, f"video:{tmp_path / 'text.mp4'}", "camera:987"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[3], check=True)
+    assert (done.stdout, done.stderr) == ("refused\nrefused\n", "")
 
 
 def test_a_dataset_that_is_none_is_an_error_of_the_dataset(tmp_path: Path) -> None:

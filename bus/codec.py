@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from bus.errors import CodecError
-from bus.messages import Message
+from bus.messages import Header, Message
 
 M = TypeVar("M", bound=Message)
 
@@ -28,6 +28,7 @@ _MAX_LIST = 16
 _MAX_MAP = 32
 _MAX_TEXT = 4096
 _MAX_DIMENSIONS = 4
+_HEADER_BYTES = 1024
 _ARRAY_KEYS = {"dtype", "shape", "data"}
 
 
@@ -54,6 +55,22 @@ def decode(payload: bytes | memoryview, message_type: type[M], max_bytes: int = 
         return msgspec.convert(fields, message_type, strict=True, dec_hook=_array_from_wire)
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise CodecError(f"{name}: {_one_line(error)}") from error
+
+
+def decode_header(payload: bytes) -> Header:
+    """The header alone, for who counts and times large messages; the rest is not read, and not checked.
+
+    Raises CodecError where the bytes do not begin with a header, as every encoded message does.
+    """
+    unpacker = msgpack.Unpacker(raw=False, strict_map_key=True, max_array_len=0, max_map_len=_MAX_MAP, max_str_len=256)
+    unpacker.feed(payload[:_HEADER_BYTES])
+    try:
+        unpacker.read_map_header()
+        if unpacker.unpack() != "header":
+            raise ValueError("does not begin with a header")
+        return msgspec.convert(unpacker.unpack(), Header, strict=True)
+    except (ValueError, TypeError, msgpack.UnpackException) as error:
+        raise CodecError(f"header: {_one_line(error)}") from error
 
 
 def _array_to_wire(value: Any) -> dict[str, Any]:

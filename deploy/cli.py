@@ -1,0 +1,140 @@
+"""The `fieldpose` command: finds the subcommand, reads its options, and turns the user's mistakes into one line.
+
+Only the module of the command that was asked for is imported. Such a module has `Options`, a frozen dataclass whose
+fields are the options, with a method `run` that returns the exit code, and its docstring is the command's help.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import io
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+from deploy.errors import UsageError
+
+COMMANDS = {
+    "demo": "the embedded scene through the whole pipeline",
+    "train": "posed images -> a field (.safetensors)",
+    "estimate": "one image, in one process, without a bus",
+    "run": "the pipeline: a source of images through every stage, each a process",
+    "stage": "one process of the pipeline, for another host or a debugger",
+    "record": "record a pipeline that is running",
+    "replay": "run the pipeline again on a recording's frames and compare the poses",
+    "info": "what a recording holds, topic by topic, and what it lacks",
+    "recover": "save what can be saved of an unfinished or damaged recording",
+    "doctor": "check this machine, the bus, the weights, a dataset",
+}
+_BAD_INPUT, _INTERRUPTED = 2, 130
+_BOX_EDGES = " \t│"
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; returns 0 on success only, 2 for bad input, 130 after Ctrl-C."""
+    arguments = sys.argv[1:] if argv is None else argv
+    try:
+        return _dispatch(arguments)
+    except KeyboardInterrupt:
+        return _INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read our output went away; Python would complain again when it flushes at the end.
+        sys.stdout = None  # type: ignore[assignment]
+        return 1
+    except Exception as error:
+        if not _is_for_the_user(error):
+            raise
+        print(f"fieldpose: {' '.join(str(error).split())}", file=sys.stderr)
+        return _BAD_INPUT
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview())
+        return 0 if arguments else _BAD_INPUT
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(f"fieldpose {version('fieldpose')}")
+        return 0
+    name, *rest = arguments
+    if name not in COMMANDS:
+        raise UsageError(f"no command {name!r}; expected one of {', '.join(COMMANDS)}")
+    module = importlib.import_module(f"deploy.commands.{name}")
+    return int(parse(module.Options, name, rest).run())
+
+
+def parse(options: type[Any], name: str, arguments: list[str]) -> Any:
+    """Options of a command from its arguments; `--config FILE` changes the defaults. Raises UsageError."""
+    import tyro
+
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(
+                options,
+                prog=f"fieldpose {name}",
+                args=arguments,
+                default=_defaults(options, arguments),
+                config=(tyro.conf.HelptextFromCommentsOff,),
+            )
+    except SystemExit as end:
+        if not end.code:
+            raise
+        raise UsageError(f"{_one_line(complaint.getvalue())}; see `fieldpose {name} --help`") from None
+
+
+def _defaults(options: type[Any], arguments: list[str]) -> Any:
+    """Options with the settings of the configuration file, where the command has both and one is given."""
+    given = _value_of("--config", arguments)
+    names = {field.name: field for field in dataclasses.fields(options)}
+    if given is None or "settings" not in names:
+        return None
+    import tyro
+
+    from deploy.settings import read_settings
+
+    required = [name for name, field in names.items() if _is_required(field)]
+    return options(**dict.fromkeys(required, tyro.MISSING), settings=read_settings(Path(given)))
+
+
+def _is_required(field: dataclasses.Field[Any]) -> bool:
+    return field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+
+
+def _value_of(flag: str, arguments: list[str]) -> str | None:
+    for argument, following in zip(arguments, [*arguments[1:], None], strict=True):
+        if argument == flag:
+            return following
+        if argument.startswith(flag + "="):
+            return argument.removeprefix(flag + "=")
+    return None
+
+
+def _one_line(framed: str) -> str:
+    """The first part of tyro's framed message, and the first option that it suggests."""
+    lines = [line.strip(_BOX_EDGES) for line in framed.splitlines() if not line.startswith(("╭", "╰"))]
+    parts = re.split(r"\n─+\n", "\n".join(lines))
+    suggested = next((re.search(r"--[\w.-]+", part) for part in parts[1:] if part.startswith("Perhaps")), None)
+    text = " ".join(parts[0].split())
+    return f"{text} (did you mean {suggested.group()}?)" if suggested else text
+
+
+def _is_for_the_user(error: Exception) -> bool:
+    from bus.errors import FieldposeError
+    from stages.errors import StageError
+
+    return isinstance(error, FieldposeError | StageError)
+
+
+def _overview() -> str:
+    width = max(map(len, COMMANDS))
+    rows = "\n".join(f"  {name:<{width}}  {what}" for name, what in COMMANDS.items())
+    return (
+        "usage: fieldpose COMMAND [OPTIONS]\n\nFinds, in real time, where a camera is relative to an object or scene"
+        f" known from posed photographs.\n\n{rows}\n\n`fieldpose COMMAND --help` describes one and gives an example;"
+        " for instance: fieldpose demo"
+    )

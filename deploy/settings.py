@@ -1,0 +1,114 @@
+"""All settings of a pipeline in one tree of frozen dataclasses, and files that change them.
+
+A configuration file is TOML, or JSON where its name ends so, with the names of the tree: `[matching]` and in it
+`matcher = "sift"`. What the file does not name keeps its default; flags on the command line win over the file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import json
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+import msgspec
+
+from bus.topics import Address
+from stages.camera.config import CameraConfig
+from stages.errors import ConfigError
+from stages.lifting.config import LiftingConfig
+from stages.matching.core import MatchingConfig
+from stages.pnp.config import PnpConfig
+from stages.refinement.config import RefinementConfig
+from stages.rendering.config import RenderingConfig
+from stages.tracking.config import TrackingConfig
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Every stage's settings; each is described where it is defined."""
+
+    address: Address = field(default_factory=Address)
+    camera: CameraConfig = field(default_factory=lambda: CameraConfig(source=""))
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    rendering: RenderingConfig = field(default_factory=RenderingConfig)
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
+    lifting: LiftingConfig = field(default_factory=LiftingConfig)
+    pnp: PnpConfig = field(default_factory=PnpConfig)
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
+
+
+def read_settings(path: Path | None) -> Settings:
+    """The defaults, changed by a file where one is given. Raises ConfigError that names the file and the key."""
+    return Settings() if path is None else changed(Settings(), read_file(path), str(path))
+
+
+def read_file(path: Path) -> dict[str, Any]:
+    """The content of a TOML or JSON file. Raises ConfigError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such configuration file") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        kind = "JSON" if path.suffix == ".json" else "TOML"
+        raise ConfigError(f"{path}: not a {kind} file ({' '.join(str(error).split())})") from error
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected tables of settings, got a {type(content).__name__}")
+    return content
+
+
+def changed(config: T, changes: dict[str, Any], origin: str, place: str = "") -> T:
+    """A dataclass with some of its values replaced, nested tables too.
+
+    Raises ConfigError that names `origin` and the key for an unknown key (with the names that are near it) and for
+    a value of the wrong type or out of range.
+    """
+    hints = get_type_hints(type(config))
+    new: dict[str, Any] = {}
+    for key, value in changes.items():
+        where = f"{place}{key}"
+        if key not in hints:
+            raise ConfigError(f"{origin}: unknown setting {where!r}; {_suggestion(key, place, list(hints))}")
+        old = getattr(config, key)
+        if not dataclasses.is_dataclass(old):
+            new[key] = _converted(value, hints[key], f"{origin}: {where}")
+        elif isinstance(value, dict):
+            new[key] = changed(old, value, origin, f"{where}.")
+        else:
+            raise ConfigError(f"{origin}: {where}: expected a table of settings, got {value!r}")
+    try:
+        return dataclasses.replace(config, **new)  # type: ignore[type-var]
+    except ConfigError as error:
+        raise ConfigError(f"{origin}: {error}") from error
+
+
+def to_json(settings: Settings) -> bytes:
+    """Every setting with its value, as a file that `read_settings` takes."""
+    return msgspec.json.format(msgspec.json.encode(settings, enc_hook=str), indent=2) + b"\n"
+
+
+def _converted(value: Any, wanted: Any, where: str) -> Any:
+    try:
+        return msgspec.convert(value, wanted, strict=True, dec_hook=_path)
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{where}: {error}, got {value!r}") from error
+
+
+def _path(wanted: type, value: Any) -> Any:
+    if wanted is Path and isinstance(value, str):
+        return Path(value)
+    raise ValueError(f"Expected `{wanted.__name__}`")
+
+
+def _suggestion(key: str, place: str, names: list[str]) -> str:
+    near = difflib.get_close_matches(key, names, n=3, cutoff=0.5)
+    known = [f"{place}{name}" for name in near or names]
+    return f"did you mean {' or '.join(known)}?" if near else f"there are {', '.join(known)}"

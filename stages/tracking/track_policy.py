@@ -119,7 +119,7 @@ class TrackPolicy:
         if self._unconfirmed is None or self._config.sequence == "photos":
             return False
         before_ns, before = self._unconfirmed
-        return before_ns != capture_ns and self._reach(capture_ns - before_ns).holds(before, pose)
+        return self._reach(capture_ns - before_ns).holds(before, pose)
 
     def _reach(self, between_ns: int) -> Limit:
         """How far a camera may be, after that time, from where it was expected."""

@@ -42,7 +42,7 @@ class TrainingConfig:
     steps: int | None = None
     """Stop after so many steps instead."""
     seed: int = 0
-    samples_per_step: int = 1 << 16
+    samples_per_step: int = 1 << 14
     """Rays are added to a step until they carry about so many samples."""
     learning_rate: float = 1e-2
     final_learning_rate: float = 5e-4

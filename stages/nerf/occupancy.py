@@ -41,18 +41,18 @@ def from_cube(space: Space, u: np.ndarray) -> np.ndarray:
 
 
 def seen_by_cameras(space: Space, n: int, cameras: list[tuple[Camera, np.ndarray]], least: int = 1) -> np.ndarray:
-    """(n, n, n) bool: cells whose centre at least `least` (camera, cam_from_object) see, in front of them."""
-    cells = np.arange(n**3)
-    points = from_cube(space, cell_positions(cells, n, np.full((1, 3), 0.5)))
-    count = np.zeros(n**3, np.int32)
-    margin = 1.03
+    """(n, n, n) bool: cells that at least `least` (camera, cam_from_object) see, judged by the centre of each 2x2x2."""
+    m = n // 2
+    points = from_cube(space, cell_positions(np.arange(m**3), m, np.full((1, 3), 0.5)))
+    count = np.zeros(m**3, np.int32)
+    margin = 1.06
     for camera, cam_from_object in cameras:
         in_cam = points @ cam_from_object[:3, :3].T + cam_from_object[:3, 3]
         with np.errstate(invalid="ignore", divide="ignore"):
             x = np.abs(in_cam[:, 0] / in_cam[:, 2] * camera.fx + camera.cx - (camera.width - 1) / 2)
             y = np.abs(in_cam[:, 1] / in_cam[:, 2] * camera.fy + camera.cy - (camera.height - 1) / 2)
             count += (in_cam[:, 2] > 0) & (x <= margin * camera.width / 2) & (y <= margin * camera.height / 2)
-    return (count >= least).reshape(n, n, n)
+    return (count >= least).reshape(m, m, m).repeat(2, 0).repeat(2, 1).repeat(2, 2)
 
 
 class OccupancyEstimate:
@@ -64,7 +64,6 @@ class OccupancyEstimate:
         self.candidates = np.flatnonzero(self.allowed)
         self.estimate = np.zeros(n**3, np.float32)
         self.occupied = allowed.copy()
-        self._scratch_u = np.empty((0, 3), np.float32)
 
     def update(self, net: Net, workers: Workers, fraction: float, decay: float = 0.95, least: float = 0.01) -> None:
         """Look at a random `fraction` of the cells and at as many of the occupied ones; then threshold anew.
@@ -79,10 +78,7 @@ class OccupancyEstimate:
         u = cell_positions(cells, self.n, self.rng.random((len(cells), 3), dtype=np.float32))
         found = np.empty(len(cells), np.float32)
         workers.each(len(cells), 4096, lambda scratch, a, b: densities(net, u, a, b, scratch.samples, found))
-        if fraction < 1:
-            self.estimate *= decay
-        else:
-            self.estimate *= decay
+        self.estimate *= decay
         np.maximum.at(self.estimate, cells, found)
         opacity = self.estimate * self.space.step
         limit = min(least, float(opacity[self.candidates].mean()))

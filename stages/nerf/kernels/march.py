@@ -53,9 +53,7 @@ def advance(
         o, d = origins[first + r], directions[first + r]
         t, far = rays.t[r], rays.far[r]
         taken = 0
-        while taken < per_ray and row < capacity:
-            if t >= far:
-                break
+        while taken < per_ray and t < far and row < capacity:
             y0, y1, y2 = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
             u0, u1, u2, grow = to_cube(dom.contracted, y0, y1, y2)
             dt = np.float32(dom.step) * grow
@@ -75,6 +73,6 @@ def advance(
                 ahead = skip(n >> 3 if state == 0 else n, u0, u1, u2, d)
                 t += dt * max(np.float32(1), np.float32(math.ceil(ahead / dt)))
         rays.t[r] = t
-        if t >= far or row >= capacity:
+        if t >= far or taken < per_ray:
             rays.alive[r] = False
     return row

@@ -1,0 +1,170 @@
+"""From posed images on disk to a trained field on disk."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+
+from stages.nerf.config import FieldConfig, TrainingConfig
+from stages.nerf.datasets import Dataset, load_dataset
+from stages.nerf.field import Field
+from stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
+from stages.nerf.raybank import View
+from stages.nerf.renderer import NumbaRenderer
+from stages.nerf.training import Progress, Trainer, evaluate
+
+if TYPE_CHECKING:
+    from stages.nerf.datasets.assemble import Holdout
+
+BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), None: (0.5, 0.5, 0.5)}
+BOUNDED_STEPS = {"object": 384, "bounded": 640}
+CONTRACTED_STEP = 1 / 128
+CONTRACTED_FAR = 64.0
+REPORT_EVERY_S = 0.25
+VALIDATION_STRIDE = 41
+
+
+@dataclass(frozen=True)
+class TrainingReport:
+    """What the progress display shows: see Progress; `validation_psnr_db` is None until it was first measured."""
+
+    progress: Progress
+    validation_psnr_db: float | None
+
+
+@dataclass(frozen=True)
+class TrainedField:
+    """The result of a training; `interrupted` where Ctrl-C ended it early."""
+
+    field: Field
+    test_psnr_db: list[float]
+    interrupted: bool
+
+
+def space_of(dataset: Dataset) -> Space:
+    """The field's space for a dataset: its box where it has one, all space contracted around its ball otherwise."""
+    bounds = dataset.bounds
+    if dataset.scene == "unbounded":
+        near = max(bounds.near / bounds.radius, 0.02)
+        centre = tuple(float(v) for v in bounds.centre)
+        return Space(True, centre, float(bounds.radius), near=near, far=CONTRACTED_FAR, step=CONTRACTED_STEP)  # type: ignore[arg-type]
+    centre = tuple(float(v) for v in bounds.aabb.mean(axis=0))
+    half = (bounds.aabb[1] - bounds.aabb[0]) / 2
+    scale = float(half.max())
+    share = tuple(float(v) for v in half / scale)
+    near = max(0.25 * bounds.near / scale, 0.01)
+    return Space(False, centre, scale, half=share, near=near, far=64.0, step=2 / BOUNDED_STEPS[dataset.scene])  # type: ignore[arg-type]
+
+
+def views_of(dataset: Dataset) -> list[View]:
+    """All images of a dataset, loaded."""
+    images = dataset.load_images()
+    return [View(r.name, im, r.camera, r.cam_from_object) for r, im in zip(dataset.images, images, strict=True)]
+
+
+def _camera_record(view: View) -> TrainingCamera:
+    c = view.camera
+    numbers = tuple(float(v) for v in view.cam_from_object.ravel())
+    return TrainingCamera(view.name, c.width, c.height, c.fx, c.fy, c.cx, c.cy, c.distortion, numbers)
+
+
+def metadata_of(dataset: Dataset, views: list[View], config: FieldConfig) -> FieldMetadata:
+    """What is known of a field before it is trained."""
+    try:
+        made_by = f"fieldpose {version('fieldpose')}"
+    except PackageNotFoundError:
+        made_by = "fieldpose"
+    return FieldMetadata(
+        space=space_of(dataset),
+        config=config,
+        background=BACKGROUNDS[dataset.background],
+        cameras=[_camera_record(v) for v in views],
+        dataset_kind=dataset.kind,
+        dataset_sha256=dataset.content_hash(),
+        unit=dataset.unit,
+        metres_per_unit=dataset.metres_per_unit,
+        has_background=dataset.scene != "object",
+        made_by=made_by,
+    )
+
+
+def train_field(
+    path: Path,
+    out: Path,
+    size: int | None = 400,
+    holdout: Holdout | None = "auto",
+    training: TrainingConfig | None = None,
+    config: FieldConfig | None = None,
+    report: Callable[[TrainingReport], None] = lambda _: None,
+) -> TrainedField:
+    """Train on a dataset's training images, measure on its held-out ones, and save; Ctrl-C ends the training early.
+
+    Raises DatasetError; nothing is written before the training is over.
+    """
+    training, config = training or TrainingConfig(), config or FieldConfig()
+    dataset = load_dataset(path, "train", size, holdout=holdout)
+    views = views_of(dataset)
+    held_out = _held_out(path, size, holdout)
+    metadata = metadata_of(dataset, views, config)
+    trainer = Trainer(views, metadata.space, config, training)
+    monitor = _Monitor(trainer, metadata, held_out[: training.validation_views], report)
+    start = time.monotonic()
+    interrupted = False
+    try:
+        trainer.run(monitor)
+    except KeyboardInterrupt:
+        interrupted = True
+    field = trainer.field(
+        replace_metadata(metadata, trained_seconds=time.monotonic() - start, trained_steps=trainer.optimiser.steps)
+    )
+    field.save(out)
+    scores = evaluate(NumbaRenderer(field, training.threads), held_out) if held_out and not interrupted else []
+    if scores:
+        field.metadata = replace_metadata(field.metadata, psnr_db=float(np.mean(scores)))
+        field.save(out)
+    return TrainedField(field, scores, interrupted)
+
+
+def replace_metadata(metadata: FieldMetadata, **changes: object) -> FieldMetadata:
+    """A copy with some entries changed."""
+    return msgspec.structs.replace(metadata, **changes)
+
+
+def _held_out(path: Path, size: int | None, holdout: Holdout | None) -> list[View]:
+    if holdout is None:
+        return []
+    both = load_dataset(path, "all", size, holdout=holdout)
+    test = tuple(record for record in both.images if record.split == "test")
+    return views_of(replace(both, images=test)) if test else []
+
+
+class _Monitor:
+    """Passes progress on at most a few times a second, and renders held-out views at each tenth of the time."""
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        metadata: FieldMetadata,
+        views: list[View],
+        report: Callable[[TrainingReport], None],
+    ):
+        self._trainer, self._metadata, self._views, self._report = trainer, metadata, views, report
+        self._psnr: float | None = None
+        self._next_time, self._next_fraction = 0.0, 0.2
+
+    def __call__(self, progress: Progress) -> None:
+        if self._views and progress.fraction >= self._next_fraction:
+            self._next_fraction += 0.2
+            renderer = NumbaRenderer(self._trainer.field(self._metadata), self._trainer.config.threads)
+            self._psnr = float(np.mean(evaluate(renderer, self._views, VALIDATION_STRIDE)))
+            renderer.close()
+        if progress.seconds >= self._next_time:
+            self._next_time = progress.seconds + REPORT_EVERY_S
+            self._report(TrainingReport(progress, self._psnr))

@@ -42,7 +42,7 @@ def main(argv: list[str] | None = None) -> int:
         return _INTERRUPTED
     except BrokenPipeError:
         # Whoever read our output went away; Python would complain again when it flushes at the end.
-        sys.stdout = None  # type: ignore[assignment]
+        sys.stdout = None
         return 1
     except Exception as error:
         if not _is_for_the_user(error):
@@ -133,8 +133,10 @@ def _is_for_the_user(error: Exception) -> bool:
 def _overview() -> str:
     width = max(map(len, COMMANDS))
     rows = "\n".join(f"  {name:<{width}}  {what}" for name, what in COMMANDS.items())
-    return (
-        "usage: fieldpose COMMAND [OPTIONS]\n\nFinds, in real time, where a camera is relative to an object or scene"
-        f" known from posed photographs.\n\n{rows}\n\n`fieldpose COMMAND --help` describes one and gives an example;"
-        " for instance: fieldpose demo"
-    )
+    return f"""usage: fieldpose COMMAND [OPTIONS]
+
+Finds, in real time, where a camera is relative to an object or scene known from posed photographs.
+
+{rows}
+
+`fieldpose COMMAND --help` describes one and gives an example; for instance: fieldpose demo"""

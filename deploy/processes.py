@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from bus.node import Handler
 from bus.protocol import Bus
@@ -36,15 +37,25 @@ class Launch:
     record: Path | None
     wait_until_ready: Callable[[], None]
 
+    def needed_field(self) -> Path:
+        """The field. Raises UsageError where none was given."""
+        if self.field is None:
+            raise UsageError("this process needs --field FIELD")
+        return self.field
+
 
 @dataclass(frozen=True)
 class ProcessSpec:
-    """A row of the table. `parallel`: its work can use several threads; `stop_s`: how long it may take to end."""
+    """A row of the table.
+
+    `parallel`: its work can use several threads; `kernels`: which of the field's it runs, and has to compile;
+    `stop_s`: how long it may take to end.
+    """
 
     name: str
-    make: Callable[[Launch], Handler] | None
-    needs_field: bool = False
+    handler: Callable[[Launch], Handler] | None
     parallel: bool = False
+    kernels: Literal["none", "render", "jacobian"] = "none"
     stop_s: float = 2.0
 
 
@@ -74,18 +85,17 @@ def _camera(launch: Launch) -> Handler:
 def _tracking(launch: Launch) -> Handler:
     from stages.tracking.node import TrackingNode
 
-    return TrackingNode(_field(launch), launch.settings.tracking)
+    return TrackingNode(launch.needed_field(), launch.settings.tracking)
 
 
 def _rendering(launch: Launch) -> Handler:
     from stages.rendering.node import RenderingNode
 
-    return RenderingNode(_field(launch), launch.settings.rendering, launch.threads)
+    return RenderingNode(launch.needed_field(), launch.settings.rendering, launch.threads)
 
 
 def _matching(launch: Launch) -> Handler:
     import torch
-
     from stages.matching.node import MatchingNode
 
     torch.set_num_threads(launch.threads)
@@ -95,7 +105,7 @@ def _matching(launch: Launch) -> Handler:
 def _lifting(launch: Launch) -> Handler:
     from stages.lifting.node import LiftingNode
 
-    return LiftingNode(_field(launch), launch.settings.lifting, launch.threads)
+    return LiftingNode(launch.needed_field(), launch.settings.lifting, launch.threads)
 
 
 def _pnp(launch: Launch) -> Handler:
@@ -107,21 +117,21 @@ def _pnp(launch: Launch) -> Handler:
 def _refinement(launch: Launch) -> Handler:
     from stages.refinement.node import RefinementNode
 
-    return RefinementNode(_field(launch), launch.settings.refinement, launch.threads)
+    return RefinementNode(launch.needed_field(), launch.settings.refinement, launch.threads)
 
 
 TABLE: dict[str, ProcessSpec] = {
     spec.name: spec
     for spec in (
-        ProcessSpec(HUB, None, stop_s=0.5),
-        ProcessSpec(RECORDER, _recorder, stop_s=2.5),
+        ProcessSpec(HUB, None, stop_s=1.0),
+        ProcessSpec(RECORDER, _recorder, stop_s=60.0),
         ProcessSpec(CAMERA, _camera),
-        ProcessSpec("tracking", _tracking, needs_field=True),
-        ProcessSpec("rendering", _rendering, needs_field=True, parallel=True),
+        ProcessSpec("tracking", _tracking),
+        ProcessSpec("rendering", _rendering, parallel=True, kernels="render"),
         ProcessSpec("matching", _matching, parallel=True),
-        ProcessSpec("lifting", _lifting, needs_field=True, parallel=True),
+        ProcessSpec("lifting", _lifting, parallel=True, kernels="render"),
         ProcessSpec("pnp", _pnp),
-        ProcessSpec("refinement", _refinement, needs_field=True, parallel=True),
+        ProcessSpec("refinement", _refinement, parallel=True, kernels="jacobian"),
     )
 }
 STAGES = tuple(name for name in TABLE if name not in (HUB, RECORDER))
@@ -137,9 +147,3 @@ def threads_of(spec: ProcessSpec, depth: int, cores: int | None = None) -> int:
 def thread_environment(threads: int) -> dict[str, str]:
     """Environment variables that hold the numeric libraries to a budget; idle threads sleep instead of spinning."""
     return {**dict.fromkeys(_THREAD_VARIABLES, str(threads)), "OMP_WAIT_POLICY": "passive", "KMP_BLOCKTIME": "0"}
-
-
-def _field(launch: Launch) -> Path:
-    if launch.field is None:
-        raise UsageError("this stage needs --field FIELD")
-    return launch.field

@@ -99,7 +99,8 @@ def _converted(value: Any, wanted: Any, where: str) -> Any:
     try:
         return msgspec.convert(value, wanted, strict=True, dec_hook=_path)
     except msgspec.ValidationError as error:
-        raise ConfigError(f"{where}: {error}, got {value!r}") from error
+        expected = str(error).split(", got")[0].replace("Expected", "expected")
+        raise ConfigError(f"{where}: {expected}, got {value!r}") from error
 
 
 def _path(wanted: type, value: Any) -> Any:

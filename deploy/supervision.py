@@ -204,7 +204,7 @@ class Supervisor:
 
 def configuration(folder: Path, programs: Sequence[Program]) -> str:
     """The file that supervisord reads."""
-    values = {
+    values: dict[str, dict[str, object]] = {
         "unix_http_server": {"file": folder / "supervisor.sock", "chmod": "0700"},
         "supervisord": {
             "nodaemon": "true",

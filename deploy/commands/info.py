@@ -1,0 +1,83 @@
+"""What a recording holds."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from bus.replay import RECORDING_RECORD, RecordingInfo, info
+from deploy.output import write_json
+from deploy.provenance import RUN_RECORD
+
+
+@dataclass(frozen=True)
+class Options:
+    """List what a recording holds, topic by topic, with what each sender's own numbers say is missing.
+
+    Example: fieldpose info out/lego.mcap
+
+    The JSON file has: path, size_bytes, messages, first_ns, last_ns, lossless, topics (key, topic, messages,
+    first_ns, last_ns, rate_hz), sources (key, source, received, written, missing), metadata, attachments (bytes).
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """The recording (.mcap)."""
+    json: Path | None = None
+    """Write the same into this file."""
+
+    def run(self) -> int:
+        """Print the tables."""
+        recording = info(self.recording)
+        write_json(self.json, asdict(recording))
+        console = Console()
+        console.print("\n".join(_description(recording)), highlight=False, soft_wrap=True)
+        console.print(_topics(recording))
+        return 0
+
+
+def _description(recording: RecordingInfo) -> Iterator[str]:
+    seconds = (recording.last_ns - recording.first_ns) / 1e9
+    began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(recording.first_ns / 1e9))
+    size = f"{recording.size_bytes / 1e6:.1f} MB"
+    yield f"{recording.path}: {recording.messages} messages in {seconds:.1f} s from {began}, {size}"
+    yield "no message lost" if recording.lossless else f"NOT LOSSLESS{_why(recording)}"
+    run = recording.metadata.get(RUN_RECORD, {})
+    yield from (f"  {name}: {value}" for name, value in run.items())
+    yield from (f"  attached: {name} ({count} bytes)" for name, count in recording.attachments.items())
+
+
+def _why(recording: RecordingInfo) -> str:
+    noted = recording.metadata.get(RECORDING_RECORD, {})
+    reasons = []
+    missing = sum(source.missing for source in recording.sources)
+    unwritten = sum(source.received - source.written for source in recording.sources)
+    if missing or unwritten:
+        reasons.append(f"{missing} messages did not come, {unwritten} came and found no room")
+    if noted.get("refused", "0") != "0":
+        reasons.append(f"{noted['refused']} were refused")
+    if "damage" in noted:
+        reasons.append(f"recovered from a damaged file ({noted['damage']})")
+    return ": " + "; ".join(reasons) if reasons else ""
+
+
+def _topics(recording: RecordingInfo) -> Table:
+    missing, unwritten = Counter[str](), Counter[str]()
+    for source in recording.sources:
+        missing[source.key] += source.missing
+        unwritten[source.key] += source.received - source.written
+    table = Table()
+    for heading in ("topic", "key", "messages", "per second", "missing", "not written"):
+        table.add_column(heading, justify="left" if heading in ("topic", "key") else "right")
+    for topic in recording.topics:
+        counts = (missing[topic.key], unwritten[topic.key])
+        table.add_row(
+            topic.topic, topic.key, str(topic.messages), f"{topic.rate_hz:.1f}", *(str(count) for count in counts)
+        )
+    return table

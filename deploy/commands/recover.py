@@ -1,0 +1,45 @@
+"""Saving what is in a damaged recording."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from bus.errors import RecordingError
+from bus.recording import partial_path, recover
+
+
+@dataclass(frozen=True)
+class Options:
+    """Save what can be saved of a recording that was not finished, or is damaged.
+
+    Example: fieldpose recover out/lego.mcap
+
+    An unfinished recording is FILE.mcap.partial; FILE.mcap will do for its name where only that is there.
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """The recording (.mcap or .mcap.partial)."""
+    out: Path | None = None
+    """The whole recording to write (default: FILE.recovered.mcap)."""
+
+    def run(self) -> int:
+        """Write the recovered recording."""
+        damaged = self._damaged()
+        out = self.out or _default_out(damaged)
+        if out.exists():
+            raise RecordingError(f"{out}: is there already; name another file with --out")
+        saved = recover(damaged, out)
+        print(f"{out}: {saved} messages saved of {damaged}")
+        return 0
+
+    def _damaged(self) -> Path:
+        partial = partial_path(self.recording)
+        return partial if not self.recording.exists() and partial.exists() else self.recording
+
+
+def _default_out(damaged: Path) -> Path:
+    whole = damaged.with_suffix("") if damaged.suffix == ".partial" else damaged
+    return whole.with_name(f"{whole.stem}.recovered{whole.suffix}")

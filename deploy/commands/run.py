@@ -1,0 +1,114 @@
+"""The whole pipeline on this machine, over a source of images."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import tyro
+
+from deploy.errors import UsageError
+from deploy.output import check_writable, write_bytes, write_json
+from deploy.pipeline import Outcome, Plan, run_pipeline
+from deploy.report import live_line, print_summary
+from deploy.results import summarise, to_csv
+from deploy.settings import Settings
+from stages.camera.config import Pace
+from stages.camera.sources import is_video
+from stages.nerf.field import load_field
+
+INTERRUPTED = 130
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Run the pipeline: a source of images through every stage, each a process of its own.
+
+    Example: fieldpose run out/lego.safetensors --source dataset:../shared/data/lego:test
+    --guess perturb:10-40deg,0.2 --record out/lego.mcap --json out/lego.json
+
+    Ctrl-C ends the run and leaves a finished recording. What the keys of the JSON file mean stands in
+    deploy/results.py.
+    """
+
+    field: tyro.conf.Positional[Path]
+    """The field (.safetensors) of the object or scene."""
+    source: str | None = None
+    """folder:DIR, dataset:DIR:test, video:FILE, camera:0 or mcap:FILE (short for --camera.source)."""
+    record: Path | None = None
+    """Record every message into this file (.mcap)."""
+    json: Path | None = None
+    """Write the figures of the run into this file."""
+    csv: Path | None = None
+    """Write a row for each frame into this file."""
+    guess: str | None = None
+    """Where to begin: perturb:10-40deg,0.2 (each frame's true pose, disturbed), train:NAME, or a JSON file; without
+    it the training views are tried one after another (short for --tracking.guess)."""
+    size: int | None = None
+    """Shrink images whose longer side has more pixels (short for --camera.size)."""
+    pace: Pace | None = None
+    """live: by the source's own times; lockstep: a frame when the one before is answered; fast: at once (short
+    for --camera.pace)."""
+    sequence: Literal["auto", "video", "photos"] = "auto"
+    """Whether motion between frames may be relied upon; auto: in videos, recordings and from cameras."""
+    passes: int | None = None
+    """Most passes over a frame (short for --tracking.passes)."""
+    depth: int | None = None
+    """Frames in flight at once (short for --tracking.depth)."""
+    matcher: str | None = None
+    """xfeat, xfeat-lighterglue, aliked-lightglue, disk-lightglue, loftr or sift (short for --matching.matcher)."""
+    refine: bool = True
+    """Refine poses by colours (--no-refine is short for --refinement.steps 0)."""
+    listen: str | None = None
+    """Address of the hub, for instance tcp/0.0.0.0:7447 (default: a free port of this machine)."""
+    logs: Path | None = None
+    """Keep the logs of the processes in this folder."""
+    config: Path | None = None
+    """TOML or JSON file of settings; flags win over it."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
+
+    def run(self) -> int:
+        """Run, print the figures, write what was asked for."""
+        load_field(self.field)
+        settings = self.with_shortcuts()
+        check_writable(self.record, self.json, self.csv)
+        plan = Plan(self.field, settings, self.record, self.listen, self.logs)
+        with live_line(settings.camera.source) as report:
+            outcome = run_pipeline(plan, report)
+        give_out(outcome, settings.camera.source, self.json, self.csv)
+        return INTERRUPTED if outcome.interrupted else 0
+
+    def with_shortcuts(self) -> Settings:
+        """The settings with the short flags applied. Raises UsageError, and ConfigError for bad values."""
+        s = self.settings
+        camera = _with(s.camera, source=self.source, size=self.size, pace=self.pace)
+        if not camera.source:
+            raise UsageError("no source of images; give --source, for instance --source folder:DIR")
+        tracking = _with(s.tracking, guess=self.guess, passes=self.passes, depth=self.depth)
+        video = is_video(camera.source)
+        if self.sequence != "auto" or not video:
+            tracking = replace(tracking, sequence="photos" if self.sequence == "auto" else self.sequence)
+        refinement = s.refinement if self.refine else replace(s.refinement, steps=0)
+        matching = _with(s.matching, matcher=self.matcher)
+        return replace(s, camera=camera, tracking=tracking, matching=matching, refinement=refinement)
+
+
+def give_out(outcome: Outcome, title: str, json: Path | None, csv: Path | None = None) -> dict[str, object]:
+    """Print and write the figures of a run; returns them."""
+    summary = summarise(outcome.results, outcome.stats, outcome.restarts, outcome.recording)
+    print_summary(summary, title)
+    write_json(json, summary)
+    if csv is not None:
+        write_bytes(csv, to_csv(outcome.results))
+    return summary
+
+
+def _with(config: T, **values: object) -> T:
+    return replace(
+        config,  # type: ignore[type-var]
+        **{name: value for name, value in values.items() if value is not None},
+    )

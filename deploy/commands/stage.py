@@ -1,0 +1,85 @@
+"""One process of the pipeline in the foreground."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from bus.node import Handler, run_node
+from bus.transport import LOCAL_HUB, ZenohBus, log_to_stderr, serve_hub, wait_for
+from deploy.lifeline import die_with_parent
+from deploy.processes import CAMERA, TABLE, Launch, ProcessSpec, thread_environment, threads_of
+from deploy.settings import Settings
+from deploy.warmup import compile_kernels
+
+_START_S = 300.0
+"""Others may be compiling their kernels."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Run one process of the pipeline in the foreground, for another host or a debugger.
+
+    Example: fieldpose stage matching --connect tcp/10.0.0.2:7447 --matching.matcher sift
+    """
+
+    name: tyro.conf.Positional[
+        Literal["hub", "recorder", "camera", "tracking", "rendering", "matching", "lifting", "pnp", "refinement"]
+    ]
+    """Which process."""
+    connect: str = LOCAL_HUB
+    """Where the hub is."""
+    listen: str | None = None
+    """Where this process listens: the hub for everybody (default: the address of --connect), any other for the
+    processes that it exchanges messages with (default: any port of this machine, for this machine alone)."""
+    field: Path | None = None
+    """The field, for the processes that need it: tracking, rendering, lifting, refinement."""
+    record: Path | None = None
+    """The recorder's file (.mcap)."""
+    threads: int | None = None
+    """Threads that it may use (default: by the process table)."""
+    wait_for: tuple[str, ...] = ()
+    """Processes that must be ready before this one begins; the camera sends nothing before they are."""
+    config: Path | None = None
+    """TOML or JSON file of settings."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
+
+    def run(self) -> int:
+        """Serve until SIGTERM, Ctrl-C, or the end of the source."""
+        if "SUPERVISOR_ENABLED" in os.environ:
+            die_with_parent()
+        log_to_stderr()
+        make_handler = TABLE[self.name].handler
+        if make_handler is None:
+            serve_hub(self.listen or self.connect)
+        else:
+            _serve(self, TABLE[self.name], make_handler)
+        return 0
+
+
+def _serve(options: Options, spec: ProcessSpec, make_handler: Callable[[Launch], Handler]) -> None:
+    threads = options.threads or threads_of(spec, options.settings.tracking.depth)
+    os.environ.update(thread_environment(threads))
+    address = options.settings.address
+    if options.field is not None and spec.kernels != "none":
+        compile_kernels(options.field, spec.name, spec.kernels == "jacobian")
+    bus = ZenohBus(options.connect, options.listen) if options.listen else ZenohBus(options.connect)
+
+    def wait_until_ready() -> None:
+        wait_for(bus, address, options.wait_for, _START_S)
+
+    try:
+        launch = Launch(bus, options.settings, threads, options.field, options.record, wait_until_ready)
+        handler = make_handler(launch)
+        bus.wait_for_hub(_START_S)
+        if spec.name != CAMERA:
+            wait_until_ready()
+        run_node(handler, bus, address)
+    finally:
+        bus.close()

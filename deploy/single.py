@@ -1,0 +1,139 @@
+"""One image through the cores of the stages, in this process and without a bus."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+from bus.messages import Reason
+from deploy.settings import Settings
+from stages.geometry import Camera
+from stages.lifting.core import Lifted, lift
+from stages.matching.core import PairMatcher, build_matcher
+from stages.nerf.rendering_api import RayRenderer
+from stages.pnp.core import PnpResult, solve
+from stages.refinement.core import RefinementResult, refine
+from stages.rendering.core import SourcedView, ViewSource
+from stages.tracking.distance import Limit
+
+T = TypeVar("T")
+
+
+@dataclass
+class PoseFound:
+    """The answer for one image: `reason` says why there is no pose; stage_ms is of the last pass."""
+
+    reason: Reason
+    cam_from_object: np.ndarray | None = None
+    covariance: np.ndarray | None = None
+    inliers: int = 0
+    correspondences: int = 0
+    residual_px: float | None = None
+    refined: bool = False
+    loss_before: float | None = None
+    loss_after: float | None = None
+    passes: int = 1
+    stage_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """Whether a pose was found."""
+        return self.cam_from_object is not None
+
+
+class PoseFinder:
+    """Renders, matches, lifts, solves and refines, again from the pose found until it settles.
+
+    `scale` is the length by which the settings' shares are measured. Raises ConfigError and WeightsError.
+    """
+
+    def __init__(self, renderer: RayRenderer, settings: Settings, scale: float) -> None:
+        self._renderer = renderer
+        self._settings = settings
+        self._views = ViewSource(renderer, settings.rendering)
+        self._matcher = PairMatcher(build_matcher(settings.matching), settings.matching)
+        tracking = settings.tracking
+        self._settled = Limit(tracking.settled_deg, tracking.settled * scale)
+
+    def find(self, image: np.ndarray, camera: Camera, guess: np.ndarray) -> PoseFound:
+        """The pose of an image (h, w, 3) uint8 from a guessed cam_from_object (4, 4); the last good pass counts."""
+        rng = np.random.default_rng(self._settings.tracking.seed)
+        found = self.one_pass(image, camera, guess, rng)
+        for passes in range(2, self._settings.tracking.passes + 1):
+            pose = found.cam_from_object
+            if pose is None or self._settled.holds(guess, pose):
+                break
+            again = self.one_pass(image, camera, pose, rng)
+            if not again.ok:
+                break
+            guess, found = pose, again
+            found.passes = passes
+        return found
+
+    def one_pass(self, image: np.ndarray, camera: Camera, guess: np.ndarray, rng: np.random.Generator) -> PoseFound:
+        """One way through the stages."""
+        clock = _Clock()
+        sourced = clock.time("rendering", lambda: self._views.view(camera, guess))
+        if sourced.visible < self._settings.rendering.min_visible:
+            return PoseFound(Reason.NOTHING_IN_VIEW, stage_ms=clock.ms)
+        view = sourced.view
+        matched = clock.time(
+            "matching", lambda: self._matcher.match(view.rgb, view.opacity, image, sourced.view_id, id(image))
+        )
+        if len(matched.confidence) < self._settings.matching.min_matches:
+            return PoseFound(Reason.TOO_FEW_MATCHES, stage_ms=clock.ms)
+        lifted = clock.time("lifting", lambda: self._lift(sourced, matched.pixels_a, rng))
+        kept = lifted.kept
+        if kept.sum() < self._settings.lifting.min_kept:
+            return PoseFound(Reason.TOO_FEW_CONSISTENT_POINTS, stage_ms=clock.ms)
+        pixels = matched.pixels_b[kept]
+        solved = clock.time(
+            "pnp", lambda: solve(pixels, lifted.points_in_object[kept], camera, self._settings.pnp)
+        )
+        if solved.cam_from_object is None:
+            return PoseFound(Reason(solved.reason), correspondences=len(pixels), stage_ms=clock.ms)
+        pose = solved.cam_from_object
+        refined = clock.time(
+            "refinement",
+            lambda: refine(
+                self._renderer, image, camera, pose, pixels[solved.inliers], rng, self._settings.refinement
+            ),
+        )
+        return _found(solved, refined, len(pixels), clock.ms)
+
+    def _lift(self, sourced: SourcedView, pixels: np.ndarray, rng: np.random.Generator) -> Lifted:
+        view = sourced.view
+        return lift(
+            self._renderer, view.depth, view.opacity, view.camera, view.cam_from_object, pixels, rng,
+            self._settings.lifting,
+        )  # fmt: skip
+
+
+class _Clock:
+    def __init__(self) -> None:
+        self.ms: dict[str, float] = {}
+
+    def time(self, name: str, work: Callable[[], T]) -> T:
+        began = time.perf_counter()
+        result = work()
+        self.ms[name] = (time.perf_counter() - began) * 1e3
+        return result
+
+
+def _found(solved: PnpResult, refined: RefinementResult, correspondences: int, ms: dict[str, float]) -> PoseFound:
+    return PoseFound(
+        reason=Reason.OK,
+        cam_from_object=refined.cam_from_object,
+        covariance=solved.covariance,
+        inliers=int(solved.inliers.sum()),
+        correspondences=correspondences,
+        residual_px=solved.residual_px,
+        refined=refined.refined,
+        loss_before=refined.loss_before,
+        loss_after=refined.loss_after,
+        stage_ms=ms,
+    )

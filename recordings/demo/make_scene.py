@@ -2,10 +2,11 @@
 
 Needs Blender as a Python module, for development only (never at run time):
 
-    pip install "bpy==4.5.*" "numpy<2" pillow
+    pip install "bpy==4.5.*" "numpy<2" pillow "opencv-python-headless<4.12"
     python recordings/demo/make_scene.py --out recordings/demo --part train
     python recordings/demo/make_scene.py --out recordings/demo --part test
     python recordings/demo/make_scene.py --out /tmp/sequence --part sequence     # then make_recording.py
+    python recordings/demo/make_scene.py --out recordings/demo --part picture
     python recordings/demo/make_scene.py --out /tmp/preview --part preview
 
 One scene unit is 0.1 m. The robot stands at the origin, z is up, and its front looks along -y.
@@ -168,10 +169,18 @@ def preview(out: Path, scene: bpy.types.Scene) -> None:
         render.picture(scene, cameras.looking(eye, np.zeros(3)), out / f"preview_{i}.jpg", seed=i)
 
 
+def picture(out: Path, scene: bpy.types.Scene) -> None:
+    """The scene as a reader of the documentation sees it."""
+    render.camera(scene, 1200, 750, 0.92)
+    scene.cycles.samples = 32
+    pose = cameras.looking(cameras.spherical(-24, 21, 3.3), np.array((0.12, 0.0, 0.06)))
+    render.picture(scene, pose, out / "picture.jpg", seed=0)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--part", choices=("train", "test", "sequence", "preview"), default="preview")
+    parser.add_argument("--part", choices=("train", "test", "sequence", "picture", "preview"), default="preview")
     parser.add_argument(
         "--baked",
         type=Path,
@@ -185,8 +194,8 @@ def main() -> None:
     about = describe()
     if options.part == "sequence":
         video(options.out, scene, about, options.every)
-    elif options.part == "preview":
-        preview(options.out, scene)
+    elif options.part in ("picture", "preview"):
+        {"picture": picture, "preview": preview}[options.part](options.out, scene)
     else:
         stills(options.out, options.part, {"train": 100, "test": 25}[options.part], scene, about)
 

@@ -1,0 +1,113 @@
+"""From posed photographs to a field."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import tyro
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from deploy.output import check_writable, progress_console, write_json
+from stages.nerf.config import FieldConfig, TrainingConfig
+
+if TYPE_CHECKING:
+    from stages.nerf.from_dataset import TrainedField, TrainingReport
+
+_LINE_EVERY_S = 30.0
+
+
+@dataclass(frozen=True)
+class Options:
+    """Learn a field from posed photographs, and measure it on the held-out ones.
+
+    Example: fieldpose train ../shared/data/lego --size 400 --minutes 5 --out out/lego.safetensors
+
+    The kind of dataset is recognised from its folder: Blender/NeRF-synthetic, transforms.json (instant-ngp,
+    nerfstudio) or LLFF. Ctrl-C ends the training early and keeps what was learnt. The JSON file has: psnr_db (mean
+    over the held-out views, null without any), psnr_db_by_view, steps, seconds, interrupted, size_bytes.
+    """
+
+    dataset: tyro.conf.Positional[Path]
+    """The folder of the dataset."""
+    out: Path
+    """The field to write (.safetensors)."""
+    size: int | None = 400
+    """Shrink images whose longer side has more pixels."""
+    minutes: float | None = None
+    """Time to train for (short for --training.minutes; 5 by default)."""
+    holdout: Literal["auto", "odd", "every8", "none"] = "auto"
+    """Which images of a dataset without splits of its own are held out: auto is odd for transforms.json, every8 for
+    LLFF."""
+    json: Path | None = None
+    """Write the figures into this file."""
+    training: TrainingConfig = dataclasses.field(default_factory=TrainingConfig)
+    model: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+
+    def run(self) -> int:
+        """Train, say how good the field is."""
+        from stages.nerf.from_dataset import train_field
+
+        check_writable(self.out, self.json)
+        training = self.training if self.minutes is None else replace(self.training, minutes=self.minutes)
+        holdout = None if self.holdout == "none" else self.holdout
+        began = time.monotonic()
+        with _progress_bar() as report:
+            trained = train_field(self.dataset, self.out, self.size, holdout, training, self.model, report)
+        figures = _figures(trained, self.out)
+        write_json(self.json, figures)
+        print(f"{self.out}: {_quality(trained)}; {figures['size_bytes'] / 1e6:.1f} MB, ", end="")
+        print(f"{figures['steps']} steps in {figures['seconds']:.0f} s, all in {time.monotonic() - began:.0f} s")
+        return 0
+
+
+def _figures(trained: TrainedField, out: Path) -> dict[str, Any]:
+    scores = trained.test_psnr_db
+    return {
+        "psnr_db": float(np.mean(scores)) if scores else None,
+        "psnr_db_by_view": scores,
+        "steps": trained.field.metadata.trained_steps,
+        "seconds": trained.field.metadata.trained_seconds,
+        "interrupted": trained.interrupted,
+        "size_bytes": out.stat().st_size,
+    }
+
+
+def _quality(trained: TrainedField) -> str:
+    if trained.interrupted:
+        return "ended early, not measured"
+    scores = trained.test_psnr_db
+    return f"{np.mean(scores):.2f} dB on {len(scores)} held-out views" if scores else "no held-out views"
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Callable[[TrainingReport], None]]:
+    """Gives a function that shows a training's progress on stderr, as lines where that is no terminal."""
+    console = progress_console()
+    columns = (TextColumn("training"), BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("reading the images", total=1.0)
+        next_line = 0.0
+
+        def report(state: TrainingReport) -> None:
+            nonlocal next_line
+            text = _in_words(state)
+            bar.update(task, completed=state.progress.fraction, description=text)
+            if not console.is_terminal and state.progress.seconds >= next_line:
+                next_line = state.progress.seconds + _LINE_EVERY_S
+                console.print(f"training: {state.progress.fraction:.0%}, {text}", highlight=False)
+
+        yield report
+
+
+def _in_words(state: TrainingReport) -> str:
+    progress = state.progress
+    loss = 10 ** (-progress.train_psnr_db / 10)
+    held_out = "" if state.validation_psnr_db is None else f", held-out views {state.validation_psnr_db:.2f} dB"
+    return f"step {progress.step}, loss {loss:.5f} ({progress.train_psnr_db:.2f} dB){held_out}"

@@ -1,0 +1,90 @@
+"""Pictures and videos of a field rendered over the camera's images."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from deploy.errors import OutputError
+from stages.geometry import Camera
+from stages.nerf.rendering_api import RenderedView
+
+EDGE_RGB = (0, 255, 170)
+_RENDER_SHARE = 0.45
+_EDGE_THRESHOLDS = (60, 140)
+
+
+def overlaid(image: np.ndarray, view: RenderedView) -> np.ndarray:
+    """An image (h, w, 3) uint8 with the render laid over it half transparent, and its outlines drawn.
+
+    Where the pose is right, the outlines lie on the image's own edges.
+    """
+    return mixed(image, view.rgb, view.opacity)
+
+
+def mixed(image: np.ndarray, rgb: np.ndarray, opacity: np.ndarray) -> np.ndarray:
+    """The same for a render given by its colours (h, w, 3) uint8 and opacity (h, w) in 0..1."""
+    share = (_RENDER_SHARE * opacity)[..., None]
+    blended = (image * (1 - share) + rgb * share).astype(np.uint8)
+    smooth = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (3, 3), 0)
+    edges = cv2.Canny(smooth, *_EDGE_THRESHOLDS) | _outline(opacity)
+    blended[edges > 0] = EDGE_RGB
+    return blended
+
+
+def _outline(opacity: np.ndarray) -> np.ndarray:
+    inside = (opacity > 0.5).astype(np.uint8)
+    return cv2.morphologyEx(inside, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) * 255
+
+
+def captioned(picture: np.ndarray, lines: list[str]) -> np.ndarray:
+    """A copy of a picture (h, w, 3) uint8 with lines of text at its top left."""
+    picture = picture.copy()
+    for row, line in enumerate(lines):
+        for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            place = (8, 18 + 17 * row)
+            cv2.putText(picture, line, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
+    return picture
+
+
+def without_distortion(image: np.ndarray, camera: Camera) -> np.ndarray:
+    """The image as the camera would take it without its lens distortion."""
+    if not any(camera.distortion):
+        return image
+    return cv2.undistort(image, camera.matrix(), np.array(camera.distortion))
+
+
+def encoded(picture: np.ndarray, path: Path) -> bytes:
+    """A picture (h, w, 3) uint8 RGB as the bytes of a file of the name's kind. Raises OutputError."""
+    try:
+        written, data = cv2.imencode(path.suffix, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    except cv2.error:
+        written = False
+    if not written:
+        raise OutputError(f"{path}: no picture can be written under this name; end it in .jpg or .png")
+    return data.tobytes()
+
+
+class VideoFile:
+    """A video (.mp4) of pictures (h, w, 3) uint8 RGB of one size, there under its name once it is whole."""
+
+    def __init__(self, path: Path, rate_hz: float, width: int, height: int) -> None:
+        self._path = path
+        self._partial = path.with_name(f"{path.stem}.partial{path.suffix}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        code = cv2.VideoWriter.fourcc(*"mp4v")
+        self._writer = cv2.VideoWriter(str(self._partial), code, rate_hz, (width, height))
+        if not self._writer.isOpened():
+            raise OutputError(f"{path}: OpenCV cannot write this video; end its name in .mp4")
+
+    def add(self, picture: np.ndarray) -> None:
+        """Append a picture."""
+        self._writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._writer.release()
+        os.replace(self._partial, self._path)

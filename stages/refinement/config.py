@@ -14,9 +14,13 @@ class RefinementConfig:
     """at most so many steps; 0 turns refinement off"""
     optimiser: Literal["lm", "adam"] = "lm"
     """lm: Levenberg-Marquardt on one sample of pixels; adam: the paper's, on a new sample in each step"""
+    derivative: Literal["image", "field"] = "image"
+    """image: by the frame's slopes, carried along by the surface's motion; field: through the field itself"""
+    blur_px: float = 1.0
+    """standard deviation of the blur under which the frame's slopes are taken; more reaches farther"""
     region: Literal["keypoints", "image"] = "keypoints"
     """where pixels are taken from: around the matched keypoints, or anywhere (wrong where something is in front)"""
-    dilations: int = 3
+    dilations: int = 4
     """n: how often the keypoints are dilated by 5 x 5 pixels"""
     samples: int = 768
     """pixels in each step"""
@@ -25,10 +29,10 @@ class RefinementConfig:
     size: int = 400
     """longer side in pixels to which the frame is shrunk"""
     colours: Literal["grey", "rgb"] = "grey"
-    """compare grey values or the three channels, at three times the cost of derivatives"""
+    """compare grey values or the three channels"""
     background: Literal["ignore", "compare"] = "ignore"
     """ignore: where the field is transparent a pixel counts for nothing; compare: the frame has the field's own"""
-    outlier: float = 0.1
+    outlier: float = 0.2
     """colour differences (0..1) well beyond it are something else than the object, and hardly pull"""
     learning_rate: float = 3e-3
     """Adam's, in radians and in shares of the distance to the surface"""

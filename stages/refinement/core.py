@@ -57,7 +57,7 @@ def refine(
     held_out = min(config.held_out, len(pixels) // 3)
     if held_out < _MIN_PIXELS:
         return unchanged
-    photometric = Photometric(renderer, config.colours == "rgb", config.outlier)
+    photometric = Photometric(renderer, config)
     judge = photometric.sample(image, camera, pixels[:held_out])
     opaque, distance = photometric.weighted_by_opacity(judge, cam_from_object)
     if distance == 0:

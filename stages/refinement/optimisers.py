@@ -5,8 +5,6 @@ Sources: Levenberg (1944) and Marquardt (1963); Kingma and Ba, Adam (2015), whic
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from stages.geometry import exp_se3
@@ -31,7 +29,7 @@ def levenberg_marquardt(
 
     `distance` is that of the surface from the camera; the pool is in random order.
     """
-    sample = _prepared(photometric, _first(pool, config.samples), cam_from_object, config)
+    sample = _prepared(photometric, pool.part(slice(config.samples)), cam_from_object, config)
     pose, damping, steps = cam_from_object, _DAMPING, 0
     here = photometric.linearise(sample, pose)
     unit = np.array([distance] * 3 + [1.0] * 3)
@@ -64,12 +62,12 @@ def adam(
 
     Its variables turn the camera about the surface, not about itself: there, turning and shifting look different.
     """
-    pool = _prepared(photometric, _first(pool, _POOL * config.samples), cam_from_object, config)
+    pool = _prepared(photometric, pool.part(slice(_POOL * config.samples)), cam_from_object, config)
     pivot = _twist_from_pivot(distance)
     first, second, pose, count = np.zeros(6), np.zeros(6), cam_from_object, len(pool.weights)
     for step in range(1, config.steps + 1):
         chosen = rng.choice(count, min(config.samples, count), replace=False)
-        gradient = pivot.T @ photometric.linearise(_part(pool, chosen), pose).gradient
+        gradient = pivot.T @ photometric.linearise(pool.part(chosen), pose).gradient
         first = _BETA1 * first + (1 - _BETA1) * gradient
         second = _BETA2 * second + (1 - _BETA2) * gradient**2
         direction = first / (1 - _BETA1**step) / (np.sqrt(second / (1 - _BETA2**step)) + _EPSILON)
@@ -91,16 +89,3 @@ def _prepared(
     if config.background == "compare":
         return sample
     return photometric.weighted_by_opacity(sample, cam_from_object)[0]
-
-
-def _first(sample: PixelSample, count: int) -> PixelSample:
-    return _part(sample, np.arange(min(count, len(sample.weights))))
-
-
-def _part(sample: PixelSample, chosen: np.ndarray) -> PixelSample:
-    return replace(
-        sample,
-        directions=sample.directions[chosen],
-        colours=sample.colours[chosen],
-        weights=sample.weights[chosen],
-    )

@@ -13,7 +13,9 @@ import numpy as np
 
 from stages.geometry import Camera
 from stages.nerf.rendering_api import RayRenderer, RenderedRays
+from stages.refinement.config import RefinementConfig
 
+_SCHARR_SUM = 32
 _SHARPNESS = 8
 """Silhouettes pull by what lies behind them; a power of the opacity takes even thinly mixed pixels out."""
 _GREY = np.array([[0.299, 0.587, 0.114]], np.float32)
@@ -21,11 +23,20 @@ _GREY = np.array([[0.299, 0.587, 0.114]], np.float32)
 
 @dataclass(frozen=True)
 class PixelSample:
-    """Pixels of a frame: directions (n, 3) float32 in the camera, z = 1; colours (n, k) in 0..1; weights (n,)."""
+    """Pixels of a frame: directions (n, 3) float32 in the camera, z = 1; colours (n, k) in 0..1; weights (n,).
+
+    slopes (n, k, 2): derivatives of the colours by the direction's x and y.
+    """
 
     directions: np.ndarray
     colours: np.ndarray
+    slopes: np.ndarray
     weights: np.ndarray
+
+    def part(self, chosen: np.ndarray | slice) -> PixelSample:
+        """Some of the pixels."""
+        values = (self.directions, self.colours, self.slopes, self.weights)
+        return PixelSample(*(value[chosen] for value in values))
 
 
 @dataclass(frozen=True)
@@ -40,15 +51,20 @@ class Linearised:
 class Photometric:
     """The loss of the differences between samples of a frame and the field rendered at a pose."""
 
-    def __init__(self, renderer: RayRenderer, rgb: bool, outlier: float) -> None:
-        self._renderer, self._scale2 = renderer, outlier**2
-        self._channels = np.eye(3, dtype=np.float32) if rgb else _GREY
+    def __init__(self, renderer: RayRenderer, config: RefinementConfig) -> None:
+        self._renderer, self._scale2 = renderer, config.outlier**2
+        self._through_field, self._blur_px = config.derivative == "field", config.blur_px
+        self._channels = np.eye(3, dtype=np.float32) if config.colours == "rgb" else _GREY
 
     def sample(self, image: np.ndarray, camera: Camera, pixels: np.ndarray) -> PixelSample:
         """The colours of whole pixels (n, 2) of an image (h, w, 3) uint8; all count the same."""
         x, y = pixels.astype(int).T
-        colours = image[y, x].astype(np.float32) / 255 @ self._channels.T
-        return PixelSample(camera.directions(pixels), colours, np.ones(len(pixels), np.float32))
+        values = (image.astype(np.float32) / 255 @ self._channels.T).reshape(*image.shape[:2], -1)
+        smooth = cv2.GaussianBlur(values, (0, 0), self._blur_px) if self._blur_px > 0 else values
+        across = cv2.Scharr(smooth, cv2.CV_32F, 1, 0).reshape(values.shape)[y, x] * (camera.fx / _SCHARR_SUM)
+        down = cv2.Scharr(smooth, cv2.CV_32F, 0, 1).reshape(values.shape)[y, x] * (camera.fy / _SCHARR_SUM)
+        ones = np.ones(len(pixels), np.float32)
+        return PixelSample(camera.directions(pixels), values[y, x], np.stack([across, down], axis=2), ones)
 
     def weighted_by_opacity(self, sample: PixelSample, cam_from_object: np.ndarray) -> tuple[PixelSample, float]:
         """The sample with weights that tell surface from background at a pose, and the median depth (0: no hit)."""
@@ -63,14 +79,21 @@ class Photometric:
 
     def linearise(self, sample: PixelSample, cam_from_object: np.ndarray) -> Linearised:
         """The loss at a pose and its derivatives by the left twist."""
-        origins, directions = _rays(sample, cam_from_object)
-        rendered, by_ray = self._renderer.render_rays_jacobian(origins, directions, self._channels)
-        jacobian = _by_twist(by_ray, sample.directions, cam_from_object)
+        rendered, jacobian = self._render(sample, cam_from_object)
         residuals, weights = self._compare(sample, rendered)
         pull = weights * (self._scale2 / (self._scale2 + residuals**2)) ** 2 / max(weights.sum(), 1e-12)
         flat = jacobian.reshape(-1, 6).astype(np.float64)
         pulled = pull.reshape(-1, 1) * flat
         return Linearised(self._mean(residuals, weights), pulled.T @ residuals.ravel(), pulled.T @ flat)
+
+    def _render(self, sample: PixelSample, cam_from_object: np.ndarray) -> tuple[RenderedRays, np.ndarray]:
+        """Colours at a pose and their derivative (n, k, 6) by the left twist."""
+        origins, directions = _rays(sample, cam_from_object)
+        if self._through_field:
+            rendered, by_ray = self._renderer.render_rays_jacobian(origins, directions, self._channels)
+            return rendered, _through_rays(by_ray, sample.directions, cam_from_object)
+        rendered = self._renderer.render_rays(origins, directions)
+        return rendered, _along_motion(sample, rendered.depth)
 
     def _compare(self, sample: PixelSample, rendered: RenderedRays) -> tuple[np.ndarray, np.ndarray]:
         residuals = (rendered.rgb @ self._channels.T - sample.colours).astype(np.float64)
@@ -98,7 +121,7 @@ def _rays(sample: PixelSample, cam_from_object: np.ndarray) -> tuple[np.ndarray,
     return np.repeat(origin[None], len(directions), axis=0), directions
 
 
-def _by_twist(by_ray: np.ndarray, directions: np.ndarray, cam_from_object: np.ndarray) -> np.ndarray:
+def _through_rays(by_ray: np.ndarray, directions: np.ndarray, cam_from_object: np.ndarray) -> np.ndarray:
     """From derivatives (n, k, 6) by origin and direction in the object to those by the left twist.
 
     A twist (rho, phi) moves the origin by -R^T rho and turns the direction d in the camera to d + d x phi.
@@ -107,3 +130,18 @@ def _by_twist(by_ray: np.ndarray, directions: np.ndarray, cam_from_object: np.nd
     by_shift = -by_ray[..., :3] @ object_to_cam
     by_turn = np.cross(by_ray[..., 3:] @ object_to_cam, directions[:, None])
     return np.concatenate([by_shift, by_turn], axis=-1)
+
+
+def _along_motion(sample: PixelSample, depth: np.ndarray) -> np.ndarray:
+    """Derivatives (n, k, 6) of rendered colours by the left twist, from the frame's slopes; 0 where nothing is hit.
+
+    A surface point that a twist moves to the right brings the colour from its left; where frame and render agree,
+    that is the frame's. Source: Lucas and Kanade (1981); Engel et al., Direct sparse odometry (2018), for the pose.
+    """
+    u, v = sample.directions[:, 0], sample.directions[:, 1]
+    inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-6), 0)
+    zero = np.zeros_like(u)
+    move_u = np.stack([inverse, zero, -u * inverse, -u * v, 1 + u * u, -v], axis=1)
+    move_v = np.stack([zero, inverse, -v * inverse, -1 - v * v, u * v, u], axis=1)
+    motion = np.stack([move_u, move_v], axis=1) * (depth > 0)[:, None, None]
+    return -sample.slopes @ motion

@@ -1,3 +1,6 @@
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
@@ -45,7 +48,7 @@ def error(result: RefinementResult) -> float:
 
 
 def test_the_gradient_is_that_of_the_loss(scene: AnalyticScene, image: np.ndarray) -> None:
-    photometric = Photometric(scene, rgb=True, outlier=10.0)
+    photometric = Photometric(scene, RefinementConfig(colours="rgb", outlier=10.0, derivative="field"))
     solid = CAMERA.grid()[scene.render_rays(*rays(CAMERA, POSE)).opacity > 0.99][::29]
     sample = photometric.sample(image, CAMERA, solid)
     pose = exp_se3([0.003, 0.002, -0.004, 0.002, -0.001, 0.003]) @ POSE
@@ -59,12 +62,20 @@ def test_the_gradient_is_that_of_the_loss(scene: AnalyticScene, image: np.ndarra
 
 
 @pytest.mark.parametrize(
-    ("optimiser", "colours", "within_deg"), [("lm", "grey", 0.02), ("lm", "rgb", 0.02), ("adam", "grey", 0.4)]
+    ("changes", "within_deg"),
+    [
+        ({}, 0.05),
+        ({"colours": "rgb"}, 0.05),
+        ({"background": "compare"}, 0.15),
+        ({"derivative": "field"}, 0.02),
+        ({"optimiser": "adam"}, 0.4),
+        ({"optimiser": "adam", "derivative": "field"}, 0.4),
+    ],
 )
 def test_refinement_recovers_the_pose(
-    scene: AnalyticScene, image: np.ndarray, keypoints: np.ndarray, optimiser: str, colours: str, within_deg: float
+    scene: AnalyticScene, image: np.ndarray, keypoints: np.ndarray, changes: dict[str, Any], within_deg: float
 ) -> None:
-    config = RefinementConfig(samples=300, held_out=150, optimiser=optimiser, colours=colours)  # type: ignore[arg-type]
+    config = replace(CONFIG, **changes)
     for seed in range(3):
         result = refine(scene, image, CAMERA, guess(seed), keypoints, np.random.default_rng(seed), config)
         assert result.refined
@@ -96,13 +107,13 @@ def test_keypoint_guided_sampling_beats_uniform_under_occlusion(scene: AnalyticS
     visible = keypoints[(keypoints[:, 0] < 68) | (keypoints[:, 1] < 33)]
     errors = {}
     for region in ("keypoints", "image"):
-        config = RefinementConfig(samples=300, held_out=150, region=region)  # type: ignore[arg-type]
+        config = replace(CONFIG, region=region)
         results = [
             refine(scene, occluded, CAMERA, guess(seed), visible, np.random.default_rng(seed), config)
             for seed in range(5)
         ]
         errors[region] = np.array([error(result) for result in results])
-    assert errors["keypoints"].max() < 0.03
+    assert errors["keypoints"].max() < 0.1
     assert np.median(errors["keypoints"]) < 0.2 * np.median(errors["image"])
 
 
@@ -119,7 +130,7 @@ def test_an_unknown_background_does_not_matter(
 def test_distortion_is_removed_from_the_frames_rays(scene: AnalyticScene) -> None:
     lens = camera(160, (-0.15, 0.04, 0.002, -0.001, 0.0))
     image, keypoints = frame_of(scene, lens), keypoints_of(scene, lens)
-    assert error(refine(scene, image, lens, guess(5), keypoints, np.random.default_rng(0), CONFIG)) < 0.03
+    assert error(refine(scene, image, lens, guess(5), keypoints, np.random.default_rng(0), CONFIG)) < 0.06
 
 
 def test_a_large_frame_is_shrunk_with_its_camera_and_keypoints(scene: AnalyticScene, keypoints: np.ndarray) -> None:

@@ -31,7 +31,7 @@ class MemoryBus:
         self._room: _Room = neighbour._room if neighbour is not None else _Room()
         self._mine: list[Closer] = []
 
-    def put(self, key: str, payload: bytes, topic: Topic) -> None:
+    def put(self, key: str, payload: bytes, topic: Topic | None = None) -> None:
         with self._room.lock:
             sinks = [sink for pattern, sink in self._room.sinks if _matches(pattern, key)]
         now_ns = time.time_ns()
@@ -56,6 +56,9 @@ class MemoryBus:
             for token in sorted(self.live(key)):
                 watcher(token, True)
             return self._enter(self._room.watchers, (key, watcher))
+
+    def settle(self, timeout_s: float, images: bool = False) -> bool:
+        return True
 
     def close(self) -> None:
         for closer in self._mine:

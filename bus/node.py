@@ -20,9 +20,9 @@ from bus.joining import Joined, Joiner, kept
 from bus.logs import Throttle, stage_logger
 from bus.messages import Header, Message, Reason, Stats
 from bus.ports import Inbox, InboxCounts, Outbox, first_header, reply_header
+from bus.protocol import SETTLE_S, Bus
 from bus.signals import Interrupted, StopSignals
 from bus.topics import FRAME, STATS, Address, Topic
-from bus.transport import Bus
 
 __all__ = ["EndOfInput", "Handler", "JoinedHandler", "Output", "first_header", "reply_header", "run_node"]
 
@@ -179,6 +179,10 @@ class _Node:
         joins = isinstance(self._handler, JoinedHandler)
         capacities = {topic: kept(topic) for topic in self._handler.inputs} if joins else None
         self._inbox = Inbox(self._bus, self._address, self._handler.inputs, capacities, self._refused)
+        if not self._bus.settle(
+            SETTLE_S, images=any(topic.priority == "data_low" for topic in self._handler.outputs)
+        ):
+            self._throttle.warning("someone on the bus does not answer")
         token = self._bus.hold(self._address.live(self._handler.name))
         try:
             while not self._stop.is_set():

@@ -10,6 +10,8 @@ from typing import Protocol
 from bus.errors import TransportError
 from bus.topics import Address, Topic
 
+SETTLE_S = 2.0
+
 Sink = Callable[[str, bytes, int], None]
 """Takes (key, payload, time of receipt in ns); is called from the bus's own threads and returns at once."""
 
@@ -26,7 +28,7 @@ class Closing(Protocol):
 class Bus(Protocol):
     """Bytes by key, and tokens that live as long as their process; a "*" in a key listens to any one part."""
 
-    def put(self, key: str, payload: bytes, topic: Topic) -> None:
+    def put(self, key: str, payload: bytes, topic: Topic | None = None) -> None:
         """Send with the topic's priority; nobody says whether it was received."""
 
     def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:
@@ -40,6 +42,12 @@ class Bus(Protocol):
 
     def watch(self, key: str, watcher: Watcher) -> Closing:
         """Tell `watcher` of the tokens held now and of each change."""
+
+    def settle(self, timeout_s: float, images: bool = False) -> bool:
+        """Wait until messages pass between this session and all others, both ways; with `images`, also large ones.
+
+        To be called after subscribing and before anyone is told that one is ready. False where some do not answer.
+        """
 
     def close(self) -> None: ...
 
@@ -57,7 +65,10 @@ class Closer:
 
 
 def wait_for(bus: Bus, address: Address, stages: Iterable[str], timeout_s: float) -> None:
-    """Return once each of `stages` is ready on the bus. Raises TransportError that names those which are not."""
+    """Return once each of `stages` is ready, and what is sent from here on reaches it.
+
+    Raises TransportError that names those which are not.
+    """
     wanted = {address.live(stage): stage for stage in stages}
     changed = threading.Condition()
     alive: set[str] = set()
@@ -71,9 +82,11 @@ def wait_for(bus: Bus, address: Address, stages: Iterable[str], timeout_s: float
     try:
         deadline = time.monotonic() + timeout_s
         with changed:
-            if changed.wait_for(lambda: wanted.keys() <= alive, deadline - time.monotonic()):
-                return
+            ready = changed.wait_for(lambda: wanted.keys() <= alive, deadline - time.monotonic())
             missing = ", ".join(sorted(stage for key, stage in wanted.items() if key not in alive))
     finally:
         watching.close()
+    if ready:
+        bus.settle(max(SETTLE_S, deadline - time.monotonic()))
+        return
     raise TransportError(f"not ready on the bus after {timeout_s:g} s: {missing}; is each of them running?")

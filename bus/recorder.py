@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bus.codec import decode
+from bus.codec import decode_header
 from bus.errors import CodecError, RecordingError
 from bus.messages import Header, Message
 from bus.node import Output
 from bus.protocol import Bus, Closing, Sink
-from bus.recording import FLUSH_S, RecordingWriter, partial_path, recover
+from bus.recording import RecordingWriter, partial_path, recover
 from bus.topics import ALL, Address, Topic
 
 __all__ = ["RECORDED", "Recorder", "RecorderHandler", "RecordingWriter", "partial_path", "recover"]
@@ -129,9 +130,8 @@ class Recorder:
     def _sink(self, topic: Topic) -> Sink:
         def sink(key: str, payload: bytes, received_ns: int) -> None:
             if not self._queue.put(_Item(key, topic, payload, received_ns)):
-                header = _header_of(topic, payload)
-                if header is not None:
-                    self._queue.put(_Item(key, topic, header, received_ns))
+                with suppress(CodecError):
+                    self._queue.put(_Item(key, topic, decode_header(payload), received_ns))
 
         return sink
 
@@ -141,11 +141,10 @@ class Recorder:
 
     def _write(self) -> None:
         try:
-            while (items := self._queue.take(FLUSH_S)) is not None:
+            while (items := self._queue.take(self.writer.flush_if_due())) is not None:
                 for item in items:
                     self._write_item(item)
                     self._queue.done(item)
-                self.writer.flush_if_due()
         except OSError as error:
             self.error = self._failure(error)
             self._queue.refuse()
@@ -161,13 +160,6 @@ class Recorder:
         return RecordingError(
             f"{partial}: cannot be written: {error.strerror}; `fieldpose recover` saves what is in it"
         )
-
-
-def _header_of(topic: Topic, payload: bytes) -> Header | None:
-    try:
-        return decode(payload, topic.message_type, topic.max_bytes).header
-    except CodecError:
-        return None
 
 
 class RecorderHandler:

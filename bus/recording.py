@@ -19,7 +19,7 @@ from bus.replay import RECORDING_RECORD, SOURCE_RECORD, Attachment, Salvage
 from bus.topics import Topic, topic_of
 
 _CHUNK_BYTES = 2 << 20
-FLUSH_S = 1.0
+_FLUSH_S = 1.0
 
 Metadata = Mapping[str, Mapping[str, str]]
 
@@ -135,10 +135,11 @@ class RecordingWriter:
         self._writer.add_message(channel, log_time_ns, payload, header.sent_ns, header.sequence % 2**32)
         self.flush_if_due()
 
-    def flush_if_due(self) -> None:
-        """Flush once a second; to be called also while nothing comes."""
-        if time.monotonic() - self._flushed > FLUSH_S:
+    def flush_if_due(self) -> float:
+        """Flush once a second, to be called also while nothing comes; return the seconds until the next time."""
+        if time.monotonic() - self._flushed >= _FLUSH_S:
             self.flush()
+        return max(0.0, self._flushed + _FLUSH_S - time.monotonic())
 
     def flush(self) -> None:
         """Hand what was written to the operating system, so that a kill of this process does not lose it."""

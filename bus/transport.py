@@ -15,6 +15,7 @@ from typing import Any
 import zenoh
 
 from bus.errors import TransportError
+from bus.greeting import Greeter
 from bus.memory import MemoryBus
 from bus.protocol import Bus, Closer, Closing, Sink, Watcher, wait_for
 from bus.signals import StopSignals
@@ -30,9 +31,11 @@ _LOCAL_PEER = "tcp/127.0.0.1:0"
 _POOL_BYTES = 128 << 20
 _ENDPOINT = re.compile(r"[a-z]+/.+:\d{1,5}([?#].*)?")
 _PRIORITIES = {"data": zenoh.Priority.DATA, "data_low": zenoh.Priority.DATA_LOW}
-# One message may wait for a slow receiver and those behind it are dropped. BLOCK lets the slowest receiver throttle
-# everyone and closes its link in the end, DROP loses messages to a receiver that is only busy for a moment.
-_CONGESTION = zenoh.CongestionControl.BLOCK_FIRST
+# A message waits this long for a receiver that is busy for a moment; while one takes nothing at all, what is meant
+# for it is dropped at once. BLOCK would let it throttle everyone and close its link after 5 s; BLOCK_FIRST lost one
+# image in a few hundred to receivers that were not slow at all.
+_CONGESTION = zenoh.CongestionControl.DROP
+_WAITS_US = {"wait_before_drop": 50_000, "max_wait_before_drop_fragments": 100_000}
 
 
 class ZenohBus:
@@ -59,7 +62,9 @@ class ZenohBus:
         }
         self._session = _open({**peer, **(settings or {})}, f"cannot use hub {hub} and listen on {listen}")
         self._publishers: dict[str, Any] = {}
+        self._declaring = threading.Lock()
         self._mine: list[Closer] = []
+        self._greeter = Greeter(self, str(self._session.zid()))
 
     def wait_for_hub(self, timeout_s: float) -> None:
         """Return once the hub answers. Raises TransportError after `timeout_s`."""
@@ -71,13 +76,16 @@ class ZenohBus:
                 )
             time.sleep(0.005)
 
-    def put(self, key: str, payload: bytes, topic: Topic) -> None:
+    def put(self, key: str, payload: bytes, topic: Topic | None = None) -> None:
         try:
-            publisher = self._publishers.get(key)
-            if publisher is None:
-                publisher = self._publishers[key] = self._session.declare_publisher(
-                    key, priority=_PRIORITIES[topic.priority], congestion_control=_CONGESTION
-                )
+            with self._declaring:
+                publisher = self._publishers.get(key)
+                if publisher is None:
+                    priority = _PRIORITIES[topic.priority if topic is not None else "data"]
+                    publisher = self._session.declare_publisher(
+                        key, priority=priority, congestion_control=_CONGESTION
+                    )
+                    self._publishers[key] = publisher
             publisher.put(payload)
         except zenoh.ZError as error:
             raise TransportError(f"cannot send on {key}: {_reason(error)}") from error
@@ -107,6 +115,9 @@ class ZenohBus:
             watcher(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         return self._closer(self._session.liveliness().declare_subscriber(key, changed, history=True).undeclare)
+
+    def settle(self, timeout_s: float, images: bool = False) -> bool:
+        return self._greeter.settle(timeout_s, images)
 
     def close(self) -> None:
         for closer in self._mine:
@@ -164,6 +175,7 @@ def _open(values: Mapping[str, Any], what: str) -> Any:
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
         "transport/link/tx/lease": 2000,
+        "transport/link/tx/queue/congestion_control/drop": _WAITS_US,
         "transport/shared_memory/enabled": True,
     }
     config = zenoh.Config()

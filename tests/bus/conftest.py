@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+
 from bus.transport import Bus, MemoryBus, ZenohBus
 
 ROOT = Path(__file__).parents[2]

@@ -8,11 +8,12 @@ import time
 from collections.abc import Callable
 
 import pytest
+from support.bus_samples import ADDRESS, frame, guess, same, truth
+
 from bus.errors import TransportError
 from bus.ports import Inbox, Outbox
 from bus.topics import FRAME, GUESS, STATS, TRUTH, Address
 from bus.transport import Bus, MemoryBus, ZenohBus, serve_hub, wait_for
-from support.bus_samples import ADDRESS, frame, guess, same, truth
 
 Sessions = tuple[Bus, Bus]
 
@@ -65,7 +66,10 @@ class TestContract:
         Outbox(sender, Address("test", "cup", "cam"), "tracking").publish(GUESS, guess(1))
         Outbox(sender, Address("elsewhere", "mug", "cam"), "tracking").publish(GUESS, guess(2))
         Outbox(sender, ADDRESS, "tracking").publish(GUESS, guess(3))
-        assert [item.message.header.frame_id for item in (everything.get(5.0), everything.get(5.0)) if item] == [1, 3]
+        assert [item.message.header.frame_id for item in (everything.get(5.0), everything.get(5.0)) if item] == [
+            1,
+            3,
+        ]
         mug = only_mug.get(5.0)
         assert mug is not None
         assert mug.message.header.frame_id == 3
@@ -223,7 +227,7 @@ class TestProcesses:
         bus.close()
 
     def test_two_hubs_on_one_port_is_one_clear_line(self, hub: str) -> None:
-        with pytest.raises(TransportError, match="no hub at .* in use") as caught:
+        with pytest.raises(TransportError, match=r"no hub at .* in use") as caught:
             serve_hub(hub)
         assert "\n" not in str(caught.value)
 

@@ -1,0 +1,399 @@
+"""The life of a stage: answers, failures, heartbeat, signals; in threads, and in processes that are killed."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+
+import pytest
+from support.bus_samples import ADDRESS, frame, guess, matches, view
+
+from bus.messages import Header, Matches, Message, Reason, Stats
+from bus.node import EndOfInput, Handler, JoinedHandler, Output, reply_header, run_node
+from bus.ports import Inbox, Outbox, Received
+from bus.topics import FRAME, GUESS, MATCHES, STATS, TRUTH, VIEW, Topic
+from bus.transport import MemoryBus, ZenohBus, wait_for
+
+
+class Matching(JoinedHandler):
+    """A stage in small: frame 13 is beyond it, frame 14 fails half way."""
+
+    name = "matching"
+    inputs = (VIEW, FRAME)
+    outputs = (MATCHES,)
+    join_timeout_s = 0.1
+
+    def process(self, joined: dict[Topic, Message]) -> Iterator[Output]:
+        frame_id = joined[FRAME].header.frame_id
+        if frame_id == 13:
+            raise RuntimeError("beyond me")
+        yield MATCHES, matches(reply_header(joined[VIEW].header), count=frame_id)
+        if frame_id == 14:
+            raise RuntimeError("half way")
+
+    def failure(self, header: Header, reason: Reason) -> Iterator[Output]:
+        yield MATCHES, matches(reply_header(header), count=0, ok=False, reason=reason)
+
+
+class Plain:
+    """A handler made of functions."""
+
+    name = "tracking"
+    inputs: tuple[Topic, ...] = (GUESS,)
+    outputs: tuple[Topic, ...] = (GUESS,)
+
+    def __init__(
+        self,
+        handle: Callable[[Topic, Message], Iterable[Output]] = lambda topic, message: (),
+        tick: Callable[[int], Iterable[Output]] = lambda now_ns: (),
+        start: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.handle, self.tick, self.start = handle, tick, start
+        self.stopped = 0
+
+    def stop(self) -> None:
+        self.stopped += 1
+
+
+@contextmanager
+def running(handler: Handler, bus: MemoryBus, stats_period_s: float = 0.5) -> Iterator[threading.Thread]:
+    stop = threading.Event()
+    thread = threading.Thread(target=run_node, args=(handler, bus, ADDRESS, stop, stats_period_s))
+    thread.start()
+    try:
+        wait_for(bus, ADDRESS, [handler.name], 5.0)
+        yield thread
+    finally:
+        stop.set()
+        thread.join(5.0)
+        assert not thread.is_alive()
+
+
+def listen(bus: MemoryBus, *topics: Topic) -> Inbox:
+    return Inbox(bus, ADDRESS, topics)
+
+
+def answer(inbox: Inbox) -> Matches:
+    received = inbox.get(5.0)
+    assert received is not None
+    assert isinstance(received.message, Matches)
+    return received.message
+
+
+def stats(inbox: Inbox) -> list[Stats]:
+    return [item.message for item in inbox.drain() if isinstance(item.message, Stats)]
+
+
+class TestJoined:
+    @pytest.fixture
+    def bus(self) -> MemoryBus:
+        return MemoryBus()
+
+    @pytest.fixture
+    def ends(self, bus: MemoryBus) -> Iterator[tuple[Outbox, Inbox]]:
+        inbox = listen(bus, MATCHES)
+        with running(Matching(), bus):
+            yield Outbox(bus, ADDRESS, "test"), inbox
+
+    def test_joined_inputs_are_answered_under_the_same_frame_and_pass(self, ends: tuple[Outbox, Inbox]) -> None:
+        outbox, inbox = ends
+        for frame_id in (1, 2, 3):
+            outbox.publish(FRAME, frame(frame_id))
+        for frame_id, pass_index in ((3, 0), (1, 0), (3, 1)):
+            outbox.publish(VIEW, view(frame_id, pass_index))
+        answers = [answer(inbox) for _ in range(3)]
+        assert [(each.header.frame_id, each.header.pass_index, len(each.confidence)) for each in answers] == [
+            (3, 0, 3),
+            (1, 0, 1),
+            (3, 1, 3),
+        ]
+        assert [each.header.sequence for each in answers] == [0, 1, 2]
+        assert {each.header.source for each in answers} == {"matching"}
+        assert answers[0].header.capture_ns == 1003
+
+    @pytest.mark.parametrize("frame_id", [13, 14])
+    def test_an_exception_is_one_failed_answer_and_the_process_goes_on(
+        self, ends: tuple[Outbox, Inbox], frame_id: int
+    ) -> None:
+        outbox, inbox = ends
+        for each in (frame_id, 2):
+            outbox.publish(FRAME, frame(each))
+            outbox.publish(VIEW, view(each))
+        failed, good = answer(inbox), answer(inbox)
+        assert (failed.ok, failed.reason, failed.header.frame_id) == (False, Reason.INTERNAL_ERROR, frame_id)
+        assert (good.ok, good.header.frame_id) == (True, 2)
+        assert inbox.get(0.05) is None
+
+    def test_a_failure_upstream_is_passed_on_at_once_with_its_reason(self, ends: tuple[Outbox, Inbox]) -> None:
+        outbox, inbox = ends
+        outbox.publish(VIEW, view(5, ok=False, reason=Reason.NOTHING_IN_VIEW))
+        failed = answer(inbox)
+        assert (failed.ok, failed.reason, failed.header.frame_id) == (False, Reason.NOTHING_IN_VIEW, 5)
+
+    def test_a_frame_that_does_not_come_is_a_failed_answer(self, ends: tuple[Outbox, Inbox]) -> None:
+        outbox, inbox = ends
+        started = time.monotonic()
+        outbox.publish(VIEW, view(5))
+        failed = answer(inbox)
+        assert (failed.ok, failed.reason, failed.header.frame_id) == (False, Reason.FRAME_MISSING, 5)
+        assert 0.08 < time.monotonic() - started < 2.0
+
+    def test_frames_are_kept_though_the_topic_is_newest_only(self, ends: tuple[Outbox, Inbox]) -> None:
+        outbox, inbox = ends
+        for frame_id in range(100, 164):
+            outbox.publish(FRAME, frame(frame_id))
+        for frame_id in (100, 130, 163):
+            outbox.publish(VIEW, view(frame_id))
+        assert [answer(inbox).ok for _ in range(3)] == [True, True, True]
+
+    def test_exceptions_are_counted_and_logged_once_a_second(
+        self, bus: MemoryBus, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        numbers = listen(bus, STATS)
+        with running(Matching(), bus, stats_period_s=0.05):
+            outbox = Outbox(bus, ADDRESS, "test")
+            outbox.publish(FRAME, frame(13))
+            for pass_index in range(12):
+                outbox.publish(VIEW, view(13, pass_index))
+            time.sleep(0.2)
+        last = stats(numbers)[-1]
+        assert (last.failed, last.received, last.published >= 12) == (12, 13, True)
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.count("beyond me") == 1
+        assert "test_node.py" in captured.err
+
+
+class TestPlain:
+    def test_a_message_is_handled_at_once(self) -> None:
+        bus = MemoryBus()
+        delays_ms: list[float] = []
+
+        def handle(topic: Topic, message: Message) -> Iterable[Output]:
+            delays_ms.append((time.time_ns() - message.header.sent_ns) / 1e6)
+            return ()
+
+        with running(Plain(handle), bus):
+            outbox = Outbox(bus, ADDRESS, "test")
+            for _ in range(30):
+                outbox.publish(GUESS, guess())
+                time.sleep(0.011)
+        assert len(delays_ms) == 30
+        assert sorted(delays_ms)[15] < 5.0
+
+    def test_ticks_come_while_idle_and_while_messages_pour_in(self) -> None:
+        bus = MemoryBus()
+        ticks: list[float] = []
+
+        def tick(now_ns: int) -> Iterable[Output]:
+            ticks.append(now_ns / 1e9)
+            return ()
+
+        def pause(topic: Topic, message: Message) -> Iterable[Output]:
+            time.sleep(0.005)
+            return ()
+
+        with running(Plain(pause, tick), bus):
+            time.sleep(0.3)
+            idle, ticks[:] = list(ticks), []
+            outbox = Outbox(bus, ADDRESS, "test")
+            for _ in range(60):
+                outbox.publish(GUESS, guess())
+            time.sleep(0.3)
+            busy = list(ticks)
+        for times in (idle, busy):
+            spaces = sorted(b - a for a, b in zip(times, times[1:], strict=False))
+            assert len(times) >= 6
+            assert spaces[len(spaces) // 2] < 0.04
+
+    def test_a_source_sends_from_its_ticks_and_ends_by_itself(self) -> None:
+        bus = MemoryBus()
+        left = list(range(3))
+
+        def tick(now_ns: int) -> Iterator[Output]:
+            if not left:
+                raise EndOfInput
+            yield GUESS, guess(left.pop(0))
+
+        inbox = listen(bus, GUESS)
+        handler = Plain(tick=tick)
+        run_node(handler, bus, ADDRESS)
+        assert [item.message.header.frame_id for item in inbox.drain()] == [0, 1, 2]
+        assert handler.stopped == 1
+        assert bus.live(ADDRESS.live("*")) == set()
+
+    def test_rubbish_on_the_wire_is_counted_logged_once_and_survived(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        bus = MemoryBus()
+        numbers, handled = listen(bus, STATS), []
+
+        def handle(topic: Topic, message: Message) -> Iterable[Output]:
+            handled.append(message)
+            return ()
+
+        with running(Plain(handle), bus):
+            for _ in range(10):
+                bus.put(ADDRESS.key(GUESS), b"\xc1rubbish", GUESS)
+            Outbox(bus, ADDRESS, "test").publish(GUESS, guess(5))
+            time.sleep(0.1)
+        assert len(handled) == 1
+        assert stats(numbers)[-1].refused == 10
+        assert capsys.readouterr().err.count("refused") == 1
+
+    def test_gaps_are_counted(self) -> None:
+        bus = MemoryBus()
+        numbers = listen(bus, STATS)
+        with running(Plain(), bus):
+            outbox, nowhere = Outbox(bus, ADDRESS, "test"), Outbox(MemoryBus(), ADDRESS, "test")
+            outbox.publish(GUESS, guess(0))
+            outbox._bus = nowhere._bus
+            for _ in range(3):
+                outbox.publish(GUESS, guess(1))
+            outbox._bus = bus
+            outbox.publish(GUESS, guess(2))
+            time.sleep(0.1)
+        assert (stats(numbers)[-1].gaps, stats(numbers)) == (3, [])
+
+    def test_an_answer_on_a_topic_that_is_no_output_is_a_failure(self) -> None:
+        bus = MemoryBus()
+        numbers = listen(bus, STATS, TRUTH)
+        with running(Plain(lambda topic, message: [(TRUTH, message)]), bus):
+            Outbox(bus, ADDRESS, "test").publish(GUESS, guess())
+            time.sleep(0.1)
+        items = numbers.drain()
+        assert all(item.topic is STATS for item in items)
+        assert isinstance(items[-1].message, Stats)
+        assert items[-1].message.failed == 1
+
+
+class TestStats:
+    def test_a_heartbeat_while_idle_and_not_ready_before_start_returns(self) -> None:
+        bus = MemoryBus()
+        numbers = listen(bus, STATS)
+        seen_while_starting: list[Received] = []
+
+        def start() -> None:
+            seen_while_starting.extend(numbers.drain())
+            assert bus.live(ADDRESS.live("*")) == set()
+
+        with running(Plain(start=start), bus, stats_period_s=0.05):
+            time.sleep(0.4)
+            ready = stats(numbers)
+        assert [item.message.ready for item in seen_while_starting] == [False]  # type: ignore[attr-defined]
+        assert len(ready) >= 4
+        assert all(each.ready and each.stage == "tracking" for each in ready)
+        assert stats(numbers)[-1].ready is False
+        assert ready[-1].rss_mb > 10
+        assert ready[-1].cpu_s > 0
+
+    def test_a_hung_loop_stops_the_heartbeat(self) -> None:
+        bus = MemoryBus()
+        numbers = listen(bus, STATS)
+        release = threading.Event()
+
+        def hang(topic: Topic, message: Message) -> Iterable[Output]:
+            release.wait(5.0)
+            return ()
+
+        with running(Plain(hang), bus, stats_period_s=0.05):
+            Outbox(bus, ADDRESS, "test").publish(GUESS, guess())
+            time.sleep(0.1)
+            stats(numbers)
+            time.sleep(0.2)
+            assert stats(numbers) == []
+            release.set()
+            time.sleep(0.2)
+            assert stats(numbers) != []
+
+    def test_busy_time_is_that_of_work_that_was_answered(self) -> None:
+        bus = MemoryBus()
+        numbers = listen(bus, STATS)
+
+        def work(topic: Topic, message: Message) -> Iterator[Output]:
+            if message.header.frame_id > 0:
+                time.sleep(0.02)
+                yield TRUTH, message
+
+        handler = Plain(work)
+        handler.outputs = (TRUTH,)
+        handler.inputs = (GUESS,)
+        with running(handler, bus):
+            outbox = Outbox(bus, ADDRESS, "test")
+            for frame_id in (0, 0, 0, 0, 1, 1):
+                message = guess(frame_id)
+                outbox.publish(GUESS, message)
+            time.sleep(0.2)
+        last = stats(numbers)[-1]
+        assert 20 <= last.busy_ms_p50 <= last.busy_ms_p90 < 1000
+
+
+STAGE = """
+    import sys, time
+    from bus.node import run_node
+    from bus.topics import GUESS
+    from bus.transport import ZenohBus
+    from support.bus_samples import ADDRESS
+
+    class Stage:
+        name, inputs, outputs = "tracking", (GUESS,), ()
+        def start(self):
+            print("starting", flush=True)
+            time.sleep(float(sys.argv[2]))
+        def handle(self, topic, message):
+            print("got", message.header.frame_id, flush=True)
+            return ()
+        def tick(self, now_ns):
+            return ()
+        def stop(self):
+            print("stopped", flush=True)
+
+    bus = ZenohBus(sys.argv[1])
+    run_node(Stage(), bus, ADDRESS)
+    bus.close()
+"""
+
+
+class TestProcesses:
+    @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+    @pytest.mark.parametrize("start_s", ["0", "60"])
+    def test_a_signal_ends_it_cleanly_also_while_it_starts(
+        self, hub: str, spawn, number: int, start_s: str
+    ) -> None:
+        process = spawn(STAGE, hub, start_s)
+        assert process.stdout.readline() == "starting\n"
+        if start_s == "0":
+            bus = ZenohBus(hub)
+            wait_for(bus, ADDRESS, ["tracking"], 5.0)
+            bus.close()
+        process.send_signal(number)
+        out, err = process.communicate(timeout=5.0)
+        assert (process.returncode, out, err) == (0, "stopped\n", "")
+
+    def test_killed_and_started_again(self, hub: str, spawn) -> None:
+        bus = ZenohBus(hub)
+        outbox = Outbox(bus, ADDRESS, "test")
+        for frame_id in (1, 2):
+            process = spawn(STAGE, hub, "0")
+            wait_for(bus, ADDRESS, ["tracking"], 10.0)
+            outbox.publish(GUESS, guess(frame_id))
+            assert [process.stdout.readline() for _ in range(2)] == ["starting\n", f"got {frame_id}\n"]
+            process.kill()
+            process.wait()
+            deadline = time.monotonic() + 2.0
+            while bus.live(ADDRESS.live("tracking")) and time.monotonic() < deadline:
+                time.sleep(0.01)
+            assert bus.live(ADDRESS.live("tracking")) == set()
+        bus.close()
+
+    def test_a_stage_that_cannot_start_ends_with_its_error(self) -> None:
+        def start() -> None:
+            raise RuntimeError("no field")
+
+        handler = Plain(start=start)
+        with pytest.raises(RuntimeError, match="no field"):
+            run_node(handler, MemoryBus(), ADDRESS)
+        assert handler.stopped == 1

@@ -1,0 +1,270 @@
+"""Recordings hold everything that was sent, say what they lack, and survive the death of who writes them."""
+
+from __future__ import annotations
+
+import json
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from support.bus_samples import ADDRESS, every_message, frame, guess, same, truth
+
+from bus.codec import encode
+from bus.errors import RecordingError
+from bus.messages import Header
+from bus.ports import Inbox, Outbox
+from bus.recorder import RECORDED, Recorder, RecorderHandler, RecordingWriter, partial_path, recover
+from bus.replay import Attachment, info, read_recording
+from bus.topics import ALL, FRAME, GUESS, STATS, TRUTH, Address
+from bus.transport import Bus, MemoryBus, ZenohBus, wait_for
+
+EVERYTHING = Address("*", "*", "*")
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
+class TestLive:
+    def test_every_topic_of_the_table_is_recorded(self, path: Path) -> None:
+        bus = MemoryBus()
+        recorder = Recorder(bus, EVERYTHING, path)
+        outbox = Outbox(bus, ADDRESS, "pnp")
+        before_ns = time.time_ns()
+        for topic, message in every_message().items():
+            outbox.publish(topic, message)
+        assert recorder.close()
+        recorded = list(read_recording(path))
+        assert {each.topic for each in recorded} == set(ALL) == set(RECORDED)
+        for each in recorded:
+            sent = every_message()[each.topic]
+            sent.header = each.message.header
+            assert same(each.message, sent)
+            assert each.key == ADDRESS.key(each.topic, "pnp")
+            assert before_ns <= each.message.header.sent_ns <= each.log_time_ns <= time.time_ns()
+
+    def test_nothing_of_500_images_over_zenoh_is_lost(self, hub: str, path: Path) -> None:
+        sender, receiver = ZenohBus(hub), ZenohBus(hub)
+        recorder = Recorder(receiver, EVERYTHING, path, from_start=True)
+        receiver.hold(ADDRESS.live("recorder"))
+        wait_for(sender, ADDRESS, ["recorder"], 5.0)
+        outbox = Outbox(sender, ADDRESS, "camera")
+        image = frame(0, width=480, height=360)
+        for frame_id in range(500):
+            image.header = Header("", 0, frame_id, 0, frame_id, 0)
+            outbox.publish(FRAME, image)
+            outbox.publish(TRUTH, truth(frame_id))
+            time.sleep(0.005)
+        deadline = time.monotonic() + 5.0
+        while recorder.writer.messages < 1000 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert recorder.close()
+        sender.close()
+        receiver.close()
+        facts = info(path)
+        assert [(each.topic, each.messages) for each in facts.topics] == [("frame", 500), ("truth", 500)]
+        assert [(each.source, each.received, each.written, each.missing) for each in facts.sources] == [
+            ("camera", 500, 500, 0)
+        ] * 2
+        assert facts.size_bytes > 500 * image.image.nbytes
+
+    def test_gaps_make_a_recording_not_lossless(self, path: Path) -> None:
+        bus = MemoryBus()
+        recorder = Recorder(bus, EVERYTHING, path, from_start=True)
+        for sequence in (2, 3, 7):
+            message = guess(sequence)
+            message.header = Header("tracking", sequence, sequence, 0, 0, 0)
+            bus.put(ADDRESS.key(GUESS), encode(message), GUESS)
+        assert not recorder.close()
+        (source,) = info(path).sources
+        assert (source.received, source.written, source.missing) == (3, 3, 2 + 3)
+        assert not info(path).lossless
+
+    def test_a_full_queue_drops_counts_and_says_so(self, path: Path) -> None:
+        bus = MemoryBus()
+        size = len(encode(frame(0)))
+        recorder = Recorder(bus, EVERYTHING, path, queue_bytes=size - 1)
+        outbox = Outbox(bus, ADDRESS, "camera")
+        for frame_id in range(5):
+            outbox.publish(FRAME, frame(frame_id))
+            outbox.publish(TRUTH, truth(frame_id))
+            time.sleep(0.02)
+        assert not recorder.close()
+        counts = {each.key.rsplit("/", 1)[-1]: each for each in info(path).sources}
+        assert (counts["frame"].received, counts["frame"].written, counts["frame"].missing) == (5, 0, 0)
+        assert (counts["truth"].received, counts["truth"].written) == (5, 5)
+
+    def test_rubbish_is_refused_and_counted(self, path: Path) -> None:
+        bus = MemoryBus()
+        recorder = Recorder(bus, EVERYTHING, path)
+        bus.put(ADDRESS.key(GUESS), b"rubbish", GUESS)
+        Outbox(bus, ADDRESS, "tracking").publish(GUESS, guess())
+        assert not recorder.close()
+        assert info(path).metadata["fieldpose.recording"]["refused"] == "1"
+        assert len(list(read_recording(path))) == 1
+
+    def test_a_disk_that_takes_no_more_is_one_clear_line(self, path: Path) -> None:
+        bus = MemoryBus()
+        recorder = Recorder(bus, EVERYTHING, path)
+
+        class FullDisk:
+            def write(self, data: bytes) -> int:
+                raise OSError(28, "No space left on device")
+
+            flush = close = tell = lambda self: 0
+
+        recorder.writer._writer._Writer__stream = FullDisk()
+        outbox = Outbox(bus, ADDRESS, "camera")
+        for frame_id in range(8):
+            outbox.publish(FRAME, frame(frame_id, width=800, height=400))
+        deadline = time.monotonic() + 5.0
+        while recorder.error is None and time.monotonic() < deadline:
+            time.sleep(0.01)
+        with pytest.raises(RecordingError, match="No space left on device; `fieldpose recover`"):
+            recorder.close()
+        assert not path.exists()
+        assert partial_path(path).exists()
+
+
+class TestFile:
+    def test_any_mcap_reader_understands_it(self, path: Path) -> None:
+        writer = RecordingWriter(path)
+        message = frame(3)
+        message.header = Header("camera", 17, 3, 0, 100, 200)
+        writer.write(ADDRESS.key(FRAME), FRAME, message, 300)
+        writer.close()
+        with open(path, "rb") as stream:
+            ((schema, channel, raw),) = make_reader(stream, validate_crcs=True).iter_messages()
+        assert (channel.topic, channel.message_encoding) == ("test/camera/cam/frame", "msgpack")
+        assert (raw.log_time, raw.publish_time, raw.sequence) == (300, 200, 17)
+        assert schema is not None
+        assert (schema.name, schema.encoding) == ("Frame", "jsonschema")
+        properties = json.loads(schema.data)["$defs"]["Frame"]["properties"]
+        assert set(properties) == {"header", "image", "encoding", "camera"}
+
+    def test_chunks_are_uncompressed_and_of_a_few_megabytes(self, path: Path) -> None:
+        writer = RecordingWriter(path)
+        for frame_id in range(20):
+            writer.write(ADDRESS.key(FRAME), FRAME, frame(frame_id, width=480, height=360), frame_id)
+        writer.close()
+        with open(path, "rb") as stream:
+            summary = make_reader(stream).get_summary()
+        assert summary is not None
+        assert {chunk.compression for chunk in summary.chunk_indexes} == {""}
+        assert all(1 << 20 < chunk.uncompressed_size < 4 << 20 for chunk in summary.chunk_indexes[:-1])
+        assert len(summary.chunk_indexes) >= 3
+
+    def test_metadata_and_attachments_are_in_it_from_the_start_on(self, path: Path) -> None:
+        writer = RecordingWriter(path, {"config": {"depth": "2"}}, [Attachment("field.txt", "text/plain", b"abc")])
+        assert b"depth" in partial_path(path).read_bytes()
+        assert b"field.txt" in partial_path(path).read_bytes()
+        assert not path.exists()
+        writer.add({"seeds": {"numpy": "7"}})
+        writer.close()
+        facts = info(path)
+        assert (facts.metadata["config"], facts.metadata["seeds"]) == ({"depth": "2"}, {"numpy": "7"})
+        assert facts.attachments == {"field.txt": 3}
+        assert not partial_path(path).exists()
+
+    def test_an_unfinished_recording_is_not_written_over(self, path: Path) -> None:
+        unfinished = RecordingWriter(path)
+        with pytest.raises(RecordingError, match="unfinished recording is in the way"):
+            RecordingWriter(path)
+        unfinished.discard()
+        RecordingWriter(path).close()
+        assert info(path).messages == 0
+
+    def test_a_folder_that_cannot_be_made_is_one_clear_line(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("")
+        with pytest.raises(RecordingError, match="cannot be written"):
+            RecordingWriter(tmp_path / "file" / "run.mcap")
+
+
+RECORD = """
+    import sys
+    from bus.node import run_node
+    from bus.recorder import RecorderHandler
+    from bus.topics import Address
+    from bus.transport import ZenohBus
+    from support.bus_samples import ADDRESS
+
+    bus = ZenohBus(sys.argv[1])
+    options = {"metadata": {"run": {"id": "7"}}, "resume": True, "from_start": True}
+    run_node(RecorderHandler(bus, Address("test", "*", "*"), sys.argv[2], **options), bus, ADDRESS)
+    bus.close()
+"""
+
+
+class TestDeath:
+    def publish(self, outbox: Outbox, ids: range) -> None:
+        for frame_id in ids:
+            outbox.publish(FRAME, frame(frame_id, width=240, height=180))
+            time.sleep(0.005)
+
+    def test_a_killed_recorder_leaves_what_recover_saves(self, hub: str, path: Path, tmp_path: Path, spawn) -> None:
+        bus = ZenohBus(hub)
+        process = spawn(RECORD, hub, str(path))
+        wait_for(bus, ADDRESS, ["recorder"], 10.0)
+        outbox = Outbox(bus, ADDRESS, "camera")
+        self.publish(outbox, range(60))
+        time.sleep(1.2)
+        process.kill()
+        process.wait()
+        assert not path.exists()
+        with pytest.raises(RecordingError, match="`fieldpose recover` saves what is in it"):
+            info(partial_path(path))
+        saved = recover(partial_path(path), tmp_path / "saved.mcap")
+        facts = info(tmp_path / "saved.mcap")
+        frames = [each for each in read_recording(tmp_path / "saved.mcap") if each.topic is FRAME]
+        assert saved == facts.messages >= 60
+        assert [each.message.header.frame_id for each in frames] == list(range(60))
+        assert np.array_equal(frames[-1].message.image, frame(59, width=240, height=180).image)  # type: ignore
+        assert not facts.lossless
+        assert facts.metadata["run"] == {"id": "7"}
+        bus.close()
+
+    def test_a_recorder_that_is_started_again_goes_on_and_knows_what_it_missed(
+        self, hub: str, path: Path, spawn
+    ) -> None:
+        bus = ZenohBus(hub)
+        outbox = Outbox(bus, ADDRESS, "camera")
+        first = spawn(RECORD, hub, str(path))
+        wait_for(bus, ADDRESS, ["recorder"], 10.0)
+        self.publish(outbox, range(20))
+        time.sleep(1.2)
+        first.kill()
+        first.wait()
+        self.publish(outbox, range(20, 25))
+        second = spawn(RECORD, hub, str(path))
+        wait_for(bus, ADDRESS, ["recorder"], 10.0)
+        self.publish(outbox, range(25, 40))
+        time.sleep(0.2)
+        second.send_signal(signal.SIGTERM)
+        assert second.wait(5.0) == 0
+        facts = info(path)
+        (camera,) = [each for each in facts.sources if each.source == "camera"]
+        assert (camera.received, camera.written, camera.missing) == (35, 35, 5)
+        assert not facts.lossless
+        assert list(path.parent.iterdir()) == [path]
+        bus.close()
+
+    def test_the_handler_listens_once_it_is_ready_and_finishes_when_stopped(self, path: Path) -> None:
+        bus: Bus = MemoryBus()
+        handler = RecorderHandler(bus, Address("test", "*", "*"), path)
+        handler.start()
+        Outbox(bus, ADDRESS, "tracking").publish(GUESS, guess())
+        assert list(handler.tick(0)) == []
+        handler.stop()
+        assert info(path).messages == 1
+
+    def test_stats_are_recorded_too(self, path: Path) -> None:
+        bus = MemoryBus()
+        inbox = Inbox(bus, ADDRESS, [STATS])
+        recorder = Recorder(bus, EVERYTHING, path, topics=[STATS])
+        Outbox(bus, ADDRESS, "pnp").publish(STATS, every_message()[STATS])
+        recorder.close()
+        assert len(inbox.drain()) == info(path).messages == 1

@@ -1,0 +1,172 @@
+"""Reading recordings whole, damaged and forged; sending them again."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from support.bus_samples import ADDRESS, frame, guess, same, truth
+
+from bus.errors import RecordingError
+from bus.messages import Header
+from bus.ports import Inbox
+from bus.recorder import RecordingWriter, recover
+from bus.replay import Attachment, info, read_attachment, read_recording, replay
+from bus.topics import FRAME, GUESS, TRUTH, Address
+from bus.transport import MemoryBus
+
+SECOND_NS = 10**9
+
+
+def record(path: Path, frames: int = 6, period_ns: int = SECOND_NS // 10) -> Path:
+    """Frames with their truth, and guesses that come in the file after frames that came later."""
+    writer = RecordingWriter(path, {"config": {"a": "b"}}, [Attachment("note", "text/plain", b"hello")])
+    for frame_id in range(frames):
+        for topic, message in ((FRAME, frame(frame_id)), (TRUTH, truth(frame_id))):
+            message.header = Header("camera", frame_id, frame_id, 0, 1000 + frame_id, 5)
+            writer.write(ADDRESS.key(topic), topic, message, 7 * SECOND_NS + frame_id * period_ns)
+    early = guess(9, pass_index=2)
+    writer.write(ADDRESS.key(GUESS), GUESS, early, 6 * SECOND_NS)
+    writer.close()
+    return path
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("recordings") / "whole.mcap")
+
+
+class TestReading:
+    def test_messages_come_in_the_order_of_their_receipt(self, recording: Path) -> None:
+        recorded = list(read_recording(recording))
+        assert len(recorded) == 13
+        assert recorded[0].topic is GUESS
+        assert [each.log_time_ns for each in recorded] == sorted(each.log_time_ns for each in recorded)
+        assert same(recorded[1].message.image, frame(0).image)  # type: ignore[attr-defined]
+
+    def test_topics_are_chosen(self, recording: Path) -> None:
+        assert [each.message.header.frame_id for each in read_recording(recording, {TRUTH})] == list(range(6))
+
+    def test_info_tells_topics_rates_sources_and_what_else_is_in_it(self, recording: Path) -> None:
+        facts = info(recording)
+        topics = {each.topic: each for each in facts.topics}
+        assert (topics["frame"].messages, topics["guess"].messages) == (6, 1)
+        assert topics["frame"].rate_hz == pytest.approx(10.0)
+        assert (topics["frame"].first_ns, topics["frame"].last_ns) == (
+            7 * SECOND_NS,
+            7 * SECOND_NS + SECOND_NS // 2,
+        )
+        assert (facts.first_ns, facts.messages, facts.lossless) == (6 * SECOND_NS, 13, True)
+        assert {each.source for each in facts.sources} == {"camera", ""}
+        assert facts.metadata["config"] == {"a": "b"}
+        assert facts.attachments == {"note": 5}
+
+    def test_attachments_are_read_by_name(self, recording: Path) -> None:
+        assert read_attachment(recording, "note") == b"hello"
+        with pytest.raises(RecordingError, match="no attachment 'field'"):
+            read_attachment(recording, "field")
+
+    def test_a_forged_message_is_one_clear_line(self, tmp_path: Path) -> None:
+        writer = RecordingWriter(tmp_path / "forged.mcap")
+        writer._put(ADDRESS.key(GUESS), GUESS, b"rubbish", Header("x", 0, 0, 0, 0, 0), 1)
+        writer.close()
+        with pytest.raises(RecordingError, match="a message on test/track/mug/cam/guess cannot be read: Guess"):
+            list(read_recording(tmp_path / "forged.mcap"))
+
+    def test_what_is_no_recording_is_one_clear_line(self, tmp_path: Path) -> None:
+        text = tmp_path / "text.mcap"
+        text.write_text("this is a text, and no recording at all " * 10)
+        for path in (text, tmp_path, tmp_path / "nowhere.mcap"):
+            for read in (lambda p: list(read_recording(p)), info, lambda p: recover(p, tmp_path / "out.mcap")):
+                with pytest.raises(RecordingError) as caught:
+                    read(path)
+                assert str(path) in str(caught.value)
+                assert "\n" not in str(caught.value)
+        assert {each.name for each in tmp_path.iterdir()} == {"text.mcap"}
+
+
+class TestDamage:
+    def test_a_cut_file_is_refused_and_recovered_up_to_the_cut(self, tmp_path: Path) -> None:
+        whole = RecordingWriter(tmp_path / "whole.mcap", {"config": {"a": "b"}})
+        for frame_id in range(40):
+            whole.write(ADDRESS.key(FRAME), FRAME, frame(frame_id, width=480, height=360), frame_id)
+        whole.close()
+        data = (tmp_path / "whole.mcap").read_bytes()
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(data[: len(data) * 3 // 4])
+        with pytest.raises(RecordingError, match="not a whole recording"):
+            list(read_recording(cut))
+        saved = recover(cut, tmp_path / "saved.mcap")
+        assert 24 <= saved <= 30
+        ids = [each.message.header.frame_id for each in read_recording(tmp_path / "saved.mcap")]
+        assert ids == list(range(saved))
+        facts = info(tmp_path / "saved.mcap")
+        assert not facts.lossless
+        assert facts.metadata["config"] == {"a": "b"}
+
+    def test_recovering_a_whole_file_loses_nothing(self, recording: Path, tmp_path: Path) -> None:
+        assert recover(recording, tmp_path / "copy.mcap") == 13
+        facts, copy = info(recording), info(tmp_path / "copy.mcap")
+        assert copy.lossless
+        assert (copy.topics, copy.sources, copy.metadata) == (facts.topics, facts.sources, facts.metadata)
+        assert read_attachment(tmp_path / "copy.mcap", "note") == b"hello"
+
+    @settings(
+        derandomize=True,
+        deadline=None,
+        max_examples=60,
+        suppress_health_check=[HealthCheck.function_scoped_fixture],
+    )
+    @given(st.data())
+    def test_any_damage_raises_recording_errors_only(
+        self, recording: Path, tmp_path: Path, data: st.DataObject
+    ) -> None:
+        damaged = bytearray(recording.read_bytes())
+        for _ in range(data.draw(st.integers(1, 6))):
+            damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+        del damaged[data.draw(st.integers(0, len(damaged))) :]
+        path = tmp_path / "damaged.mcap"
+        path.write_bytes(damaged)
+        for read in (lambda p: list(read_recording(p)), info, lambda p: recover(p, tmp_path / "saved.mcap")):
+            try:
+                read(path)
+            except RecordingError as error:
+                assert "\n" not in str(error)
+
+
+class TestReplay:
+    def test_frames_keep_their_ids_and_capture_times_and_get_a_new_sender(self, recording: Path) -> None:
+        bus = MemoryBus()
+        inbox = Inbox(bus, ADDRESS, [FRAME, GUESS], {FRAME: 64})
+        assert replay(bus, recording, {FRAME, GUESS}, rate=None) == 7
+        headers = [item.message.header for item in inbox.drain()]
+        assert [(header.frame_id, header.pass_index, header.capture_ns) for header in headers] == [
+            (9, 2, 1009),
+            *((n, 0, 1000 + n) for n in range(6)),
+        ]
+        assert [header.sequence for header in headers] == [0, *range(6)]
+        assert {header.source for header in headers} == {"replay"}
+        assert all(header.sent_ns > 1000 for header in headers)
+
+    def test_the_rate_is_kept(self, recording: Path) -> None:
+        for rate, seconds in ((1.0, 0.5), (4.0, 0.125)):
+            started = time.monotonic()
+            replay(MemoryBus(), recording, {FRAME}, rate=rate)
+            assert seconds <= time.monotonic() - started < seconds + 0.3
+
+    def test_another_pipeline_may_be_the_target(self, recording: Path) -> None:
+        bus, target = MemoryBus(), Address("test", "cup", "other")
+        inbox = Inbox(bus, target, [TRUTH])
+        replay(bus, recording, {TRUTH}, rate=None, address=target)
+        assert len(inbox.drain()) == 6
+
+    def test_it_can_be_stopped(self, recording: Path) -> None:
+        stop = threading.Event()
+        threading.Timer(0.05, stop.set).start()
+        started = time.monotonic()
+        assert replay(MemoryBus(), recording, {FRAME}, rate=0.01, stop=stop) == 1
+        assert time.monotonic() - started < 2.0

@@ -71,10 +71,11 @@ class OccupancyEstimate:
         A cell is occupied where a step through it has an opacity of at least `least`, or more than the mean has.
         """
         count = max(1, int(len(self.candidates) * fraction))
-        cells = self.rng.choice(self.candidates, count, replace=False) if fraction < 1 else self.candidates
-        occupied = np.flatnonzero(self.occupied.ravel())
-        if fraction < 1 and len(occupied):
-            cells = np.concatenate([cells, self.rng.choice(occupied, min(count, len(occupied)), replace=False)])
+        cells = self.candidates
+        if fraction < 1:
+            occupied = np.flatnonzero(self.occupied.ravel())
+            among = occupied if len(occupied) else self.candidates
+            cells = np.concatenate([self._some(self.candidates, count), self._some(among, min(count, len(among)))])
         u = cell_positions(cells, self.n, self.rng.random((len(cells), 3), dtype=np.float32))
         found = np.empty(len(cells), np.float32)
         workers.each(len(cells), 4096, lambda scratch, a, b: densities(net, u, a, b, scratch.samples, found))
@@ -83,3 +84,7 @@ class OccupancyEstimate:
         opacity = self.estimate * self.space.step
         limit = min(least, float(opacity[self.candidates].mean()))
         self.occupied = ((opacity > limit) & self.allowed).reshape(self.n, self.n, self.n)
+
+    def _some(self, cells: np.ndarray, count: int) -> np.ndarray:
+        """Random ones, some of them perhaps twice: drawing without repeats would sort millions of cells."""
+        return cells[self.rng.integers(0, len(cells), count)]

@@ -25,6 +25,7 @@ PER_RAY = 8
 STOP_BELOW = 1e-3
 CHUNK = 512
 OCCUPANCY_EVERY = 16
+SETTLED = 1024
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Trainer:
     def step(self, fraction: float) -> float:
         """One batch at a `fraction` 0..1 of the schedule; returns its mean squared error."""
         config = self.config
-        if self.optimiser.steps % OCCUPANCY_EVERY == 0:
+        if self.optimiser.steps % (OCCUPANCY_EVERY if self.optimiser.steps < SETTLED else 4 * OCCUPANCY_EVERY) == 0:
             self.update_occupancy()
         rate = config.learning_rate * (config.final_learning_rate / config.learning_rate) ** fraction
         n = self._rays
@@ -92,7 +93,7 @@ class Trainer:
     def update_occupancy(self) -> None:
         """Look again at a part of the grid, at all of it the first time."""
         steps = self.optimiser.steps
-        self._occupancy.update(self.net, self.workers, 1.0 if steps == 0 else (0.25 if steps < 256 else 1 / 16))
+        self._occupancy.update(self.net, self.workers, 1.0 if steps == 0 else (0.25 if steps < 256 else 1 / 8))
         self._domain = domain_of(self.space, self._occupancy.occupied)
 
     def run(self, report: Callable[[Progress], None]) -> tuple[int, float]:

@@ -11,10 +11,18 @@ from rich.console import Console
 
 from deploy.errors import OutputError
 
+_FILE_WIDTH = 140
+
 
 def progress_console() -> Console:
     """Where progress goes: stderr, so that what a command prints can be read by other programs."""
     return Console(stderr=True)
+
+
+def result_console() -> Console:
+    """Where results go: stdout, with room for tables where that is no terminal."""
+    console = Console()
+    return console if console.is_terminal else Console(width=_FILE_WIDTH)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -22,15 +22,10 @@ def overlaid(image: np.ndarray, view: RenderedView) -> np.ndarray:
 
     Where the pose is right, the outlines lie on the image's own edges.
     """
-    return mixed(image, view.rgb, view.opacity)
-
-
-def mixed(image: np.ndarray, rgb: np.ndarray, opacity: np.ndarray) -> np.ndarray:
-    """The same for a render given by its colours (h, w, 3) uint8 and opacity (h, w) in 0..1."""
-    share = (_RENDER_SHARE * opacity)[..., None]
-    blended = (image * (1 - share) + rgb * share).astype(np.uint8)
-    smooth = cv2.GaussianBlur(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), (3, 3), 0)
-    edges = cv2.Canny(smooth, *_EDGE_THRESHOLDS) | _outline(opacity)
+    share = (_RENDER_SHARE * view.opacity)[..., None]
+    blended = (image * (1 - share) + view.rgb * share).astype(np.uint8)
+    smooth = cv2.GaussianBlur(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), (3, 3), 0)
+    edges = cv2.Canny(smooth, *_EDGE_THRESHOLDS) | _outline(view.opacity)
     blended[edges > 0] = EDGE_RGB
     return blended
 
@@ -80,9 +75,11 @@ class VideoFile:
         if not self._writer.isOpened():
             raise OutputError(f"{path}: OpenCV cannot write this video; end its name in .mp4")
 
-    def add(self, picture: np.ndarray) -> None:
-        """Append a picture."""
-        self._writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    def add(self, picture: np.ndarray, times: int) -> None:
+        """Append a picture so many times."""
+        bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+        for _ in range(times):
+            self._writer.write(bgr)
 
     def close(self) -> None:
         """Finish the file."""

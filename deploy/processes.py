@@ -10,7 +10,6 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from bus.node import Handler
 from bus.protocol import Bus
@@ -48,14 +47,14 @@ class Launch:
 class ProcessSpec:
     """A row of the table.
 
-    `parallel`: its work can use several threads; `kernels`: which of the field's it runs, and has to compile;
-    `stop_s`: how long it may take to end.
+    `parallel`: its work can use several threads; `renders`: it runs the field's kernels; `stop_s`: how long it
+    may take to end.
     """
 
     name: str
     handler: Callable[[Launch], Handler] | None
     parallel: bool = False
-    kernels: Literal["none", "render", "jacobian"] = "none"
+    renders: bool = False
     stop_s: float = 2.0
 
 
@@ -127,11 +126,11 @@ TABLE: dict[str, ProcessSpec] = {
         ProcessSpec(RECORDER, _recorder, stop_s=60.0),
         ProcessSpec(CAMERA, _camera),
         ProcessSpec("tracking", _tracking),
-        ProcessSpec("rendering", _rendering, parallel=True, kernels="render"),
+        ProcessSpec("rendering", _rendering, parallel=True, renders=True),
         ProcessSpec("matching", _matching, parallel=True),
-        ProcessSpec("lifting", _lifting, parallel=True, kernels="render"),
+        ProcessSpec("lifting", _lifting, parallel=True, renders=True),
         ProcessSpec("pnp", _pnp),
-        ProcessSpec("refinement", _refinement, parallel=True, kernels="jacobian"),
+        ProcessSpec("refinement", _refinement, parallel=True, renders=True),
     )
 }
 STAGES = tuple(name for name in TABLE if name not in (HUB, RECORDER))

@@ -6,10 +6,9 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
-from deploy.output import progress_console
+from deploy.output import progress_console, result_console
 from deploy.pipeline import Progress
 
 _MISSING = "-"
@@ -52,7 +51,7 @@ def _in_words(progress: Progress) -> str:
 
 def print_summary(summary: Mapping[str, Any], title: str) -> None:
     """Print the tables of a run's summary on stdout."""
-    console = Console()
+    console = result_console()
     console.print(_figures(summary, title))
     console.print(_stages(summary))
 

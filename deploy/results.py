@@ -134,8 +134,8 @@ def accuracy(results: Sequence[FrameResult]) -> dict[str, Any]:
     turns, shifts = [error[0] for error in errors], [error[1] for error in errors]
     return {
         "frames_with_truth": len(with_truth),
-        "rotation_error_deg": _spread(turns),
-        "translation_error": _spread(shifts),
+        "rotation_error_deg": spread(turns),
+        "translation_error": spread(shifts),
         "share_re_below_5deg": _share(turns, CLOSE_DEG, len(with_truth)),
         "share_te_below_0.05": _share(shifts, CLOSE, len(with_truth)),
         "out_of_view": {
@@ -188,7 +188,8 @@ def _quantiles(values: Sequence[float], percents: Sequence[int]) -> dict[str, fl
     return {f"p{q}": float(np.percentile(values, q)) if values else None for q in percents}
 
 
-def _spread(values: Sequence[float]) -> dict[str, float] | None:
+def spread(values: Sequence[float]) -> dict[str, float] | None:
+    """Mean, median and 90th percentile; None without any value."""
     if not values:
         return None
     median, p90 = np.percentile(values, (50, 90))

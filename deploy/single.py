@@ -91,9 +91,7 @@ class PoseFinder:
         if kept.sum() < self._settings.lifting.min_kept:
             return PoseFound(Reason.TOO_FEW_CONSISTENT_POINTS, stage_ms=clock.ms)
         pixels = matched.pixels_b[kept]
-        solved = clock.time(
-            "pnp", lambda: solve(pixels, lifted.points_in_object[kept], camera, self._settings.pnp)
-        )
+        solved = clock.time("pnp", lambda: solve(pixels, lifted.points_in_object[kept], camera, self._settings.pnp))
         if solved.cam_from_object is None:
             return PoseFound(Reason(solved.reason), correspondences=len(pixels), stage_ms=clock.ms)
         pose = solved.cam_from_object

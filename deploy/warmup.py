@@ -15,8 +15,8 @@ from bus.logs import stage_logger
 _WORTH_TELLING_S = 3.0
 
 
-def compile_kernels(field: Path, process: str, jacobian: bool) -> None:
-    """Have this process's kernels compiled, or fetched from the cache that they share.
+def compile_kernels(field: Path, process: str) -> None:
+    """Have the rendering kernels compiled, or fetched from the cache that processes share.
 
     Processes take turns, so that the first compiles and the others find the result. Raises FieldFileError.
     """
@@ -24,7 +24,7 @@ def compile_kernels(field: Path, process: str, jacobian: bool) -> None:
 
     with one_at_a_time():
         began = time.monotonic()
-        warm_up(load_renderer(field), jacobian)
+        warm_up(load_renderer(field))
         seconds = time.monotonic() - began
     if seconds > _WORTH_TELLING_S:
         stage_logger(process).info("compiled the kernels, for this and the next start", seconds=round(seconds, 1))

@@ -9,11 +9,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 
 from bus.replay import RECORDING_RECORD, RecordingInfo, info
-from deploy.output import write_json
+from deploy.output import result_console, write_json
 from deploy.provenance import RUN_RECORD
 
 
@@ -36,7 +35,7 @@ class Options:
         """Print the tables."""
         recording = info(self.recording)
         write_json(self.json, asdict(recording))
-        console = Console()
+        console = result_console()
         console.print("\n".join(_description(recording)), highlight=False, soft_wrap=True)
         console.print(_topics(recording))
         return 0

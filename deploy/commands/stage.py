@@ -67,8 +67,8 @@ def _serve(options: Options, spec: ProcessSpec, make_handler: Callable[[Launch],
     threads = options.threads or threads_of(spec, options.settings.tracking.depth)
     os.environ.update(thread_environment(threads))
     address = options.settings.address
-    if options.field is not None and spec.kernels != "none":
-        compile_kernels(options.field, spec.name, spec.kernels == "jacobian")
+    if options.field is not None and spec.renders:
+        compile_kernels(options.field, spec.name)
     bus = ZenohBus(options.connect, options.listen) if options.listen else ZenohBus(options.connect)
 
     def wait_until_ready() -> None:

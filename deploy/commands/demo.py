@@ -1,0 +1,81 @@
+"""The embedded scene through the whole pipeline."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.progress import Progress
+
+from deploy.commands.run import INTERRUPTED, give_out
+from deploy.output import check_writable, progress_console, write_bytes, write_json
+from deploy.pipeline import Outcome, Plan, run_pipeline
+from deploy.report import live_line
+from deploy.scene import demo_file
+from deploy.settings import Settings
+
+
+@dataclass(frozen=True)
+class Options:
+    """Run a recorded camera sequence through the whole pipeline, with the field that is shipped with it.
+
+    Example: fieldpose demo --out out/demo
+
+    It plays at the camera's own 30 frames a second; what the pipeline cannot keep up with is dropped at the door.
+    Writes into the folder: summary.json (keys as of `fieldpose run`), recording.mcap, and overlay.jpg and overlay.mp4: the field rendered at the poses found, over the camera's images.
+    """
+
+    out: Path = Path("out/demo")
+    """The folder to write into."""
+    json: Path | None = None
+    """Write the figures into this file too."""
+    video: bool = True
+    """Write the picture and the video."""
+    logs: Path | None = None
+    """Keep the logs of the processes in this folder."""
+    config: Path | None = None
+    """TOML or JSON file of settings; flags win over it."""
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
+
+    def run(self) -> int:
+        """Run, print the tables, write the files."""
+        field, sequence = demo_file("field.safetensors"), demo_file("sequence.mcap")
+        recording = self.out / "recording.mcap"
+        check_writable(recording, self.json)
+        camera = replace(self.settings.camera, source=f"mcap:{sequence}")
+        plan = Plan(field, replace(self.settings, camera=camera), recording, logs=self.logs)
+        with live_line("demo") as report:
+            outcome = run_pipeline(plan, report)
+        summary = give_out(outcome, "demo", self.out / "summary.json")
+        write_json(self.json, summary)
+        if outcome.interrupted:
+            return INTERRUPTED
+        if self.video:
+            self._show(outcome, field, recording)
+        print(f"written: {', '.join(str(path) for path in sorted(self.out.iterdir()))}")
+        return 0
+
+    def _show(self, outcome: Outcome, field: Path, recording: Path) -> None:
+        from deploy.overlay import encoded
+        from deploy.showing import pictures, write_video
+        from stages.nerf.loading import load_renderer
+
+        renderer = load_renderer(field, threads=0)
+        with _bar("rendering the video") as report:
+            best = write_video(self.out / "overlay.mp4", pictures(recording, outcome.results, renderer, report))
+        if best is not None:
+            path = self.out / "overlay.jpg"
+            write_bytes(path, encoded(best.pixels, path))
+
+
+@contextmanager
+def _bar(title: str) -> Iterator[Callable[[int, int], None]]:
+    console = progress_console()
+    with Progress(console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task(title, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -1,0 +1,119 @@
+"""Running the pipeline again on the frames of a recording."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import tyro
+
+from bus.messages import State
+from bus.replay import RecordingInfo, info, read_recording
+from bus.topics import STATE
+from deploy.commands.run import INTERRUPTED
+from deploy.output import check_writable, result_console, write_json
+from deploy.pipeline import Plan, run_pipeline
+from deploy.provenance import recorded_field, recorded_settings
+from deploy.report import live_line, print_summary
+from deploy.results import FrameResult, spread, summarise
+from deploy.settings import Settings, changed, read_file
+from stages.camera.config import Pace
+from stages.geometry import rotation_error_deg, translation_error
+
+
+@dataclass(frozen=True)
+class Options:
+    """Run the pipeline again on a recording's camera frames, and tell how far each pose is from the recorded one.
+
+    Example: fieldpose replay out/lego.mcap --json out/replay.json
+
+    Field and settings are those of the recording. The JSON file has: compared (frames with a pose in both runs),
+    only_recorded, only_replayed, rotation_difference_deg and translation_difference (each mean, median, p90, max;
+    null without any), and replay (the keys of `fieldpose run`).
+    """
+
+    recording: tyro.conf.Positional[Path]
+    """The recording (.mcap)."""
+    field: Path | None = None
+    """Another field than the recording's."""
+    config: Path | None = None
+    """TOML or JSON file of settings that replace recorded ones."""
+    pace: Pace = "lockstep"
+    """lockstep: every frame, each when the one before has been answered; live: at the recorded pace."""
+    record: Path | None = None
+    """Record this run too."""
+    json: Path | None = None
+    """Write the figures into this file."""
+
+    def run(self) -> int:
+        """Run, compare, print."""
+        check_writable(self.record, self.json)
+        recorded = info(self.recording)
+        with tempfile.TemporaryDirectory(prefix="fieldpose-") as folder, live_line("replay") as report:
+            field = self.field or recorded_field(self.recording, recorded, Path(folder))
+            outcome = run_pipeline(Plan(field, self._settings(), self.record), report)
+        summary = summarise(outcome.results, outcome.stats, outcome.restarts, outcome.recording)
+        comparison = compare(recorded_poses(self.recording), outcome.results)
+        print_summary(summary, f"replay of {self.recording}")
+        _print(comparison, recorded)
+        write_json(self.json, {**comparison, "replay": summary})
+        return INTERRUPTED if outcome.interrupted else 0
+
+    def _settings(self) -> Settings:
+        settings = recorded_settings(self.recording)
+        if self.config is not None:
+            settings = changed(settings, read_file(self.config), str(self.config))
+        # The frames are recorded as they were sent: shrunk, and with their camera.
+        camera = replace(
+            settings.camera, source=f"mcap:{self.recording}", size=None, camera_file=None, pace=self.pace
+        )
+        return replace(settings, camera=camera)
+
+
+def recorded_poses(path: Path) -> dict[int, np.ndarray]:
+    """The measured pose of each frame of a recording, as its tracking reported them. Raises RecordingError."""
+    states = (cast(State, recorded.message) for recorded in read_recording(path, (STATE,)))
+    return {
+        state.header.frame_id: np.array(state.cam_from_object)
+        for state in states
+        if state.cam_from_object is not None and state.score > 0
+    }
+
+
+def compare(recorded: Mapping[int, np.ndarray], results: list[FrameResult]) -> dict[str, Any]:
+    """How far poses of the same frame are apart, under the keys that `Options` documents."""
+    replayed = {r.frame_id: r.cam_from_object for r in results if r.cam_from_object is not None}
+    both = sorted(recorded.keys() & replayed.keys())
+    turns = [rotation_error_deg(recorded[i], replayed[i]) for i in both]
+    shifts = [translation_error(recorded[i], replayed[i]) for i in both]
+    return {
+        "compared": len(both),
+        "only_recorded": len(recorded.keys() - replayed.keys()),
+        "only_replayed": len(replayed.keys() - recorded.keys()),
+        "rotation_difference_deg": _with_max(turns),
+        "translation_difference": _with_max(shifts),
+    }
+
+
+def _with_max(values: list[float]) -> dict[str, float] | None:
+    found = spread(values)
+    return None if found is None else {**found, "max": max(values)}
+
+
+def _print(comparison: Mapping[str, Any], recorded: RecordingInfo) -> None:
+    console = result_console()
+    counts = "frames with both poses: {compared}, only the recorded: {only_recorded}, only the new: {only_replayed}"
+    console.print(counts.format(**comparison), highlight=False)
+    for key, what, unit in (
+        ("rotation_difference_deg", "rotation", "deg"),
+        ("translation_difference", "translation", "units"),
+    ):
+        if comparison[key] is not None:
+            text = ", ".join(f"{name} {value:.4g}" for name, value in comparison[key].items())
+            console.print(f"from the recorded poses, {what}: {text} {unit}", highlight=False)
+    if not recorded.lossless:
+        console.print("the recording is not lossless: `fieldpose info` tells what it lacks", highlight=False)

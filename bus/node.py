@@ -160,6 +160,8 @@ class _Node:
         self._next_tick = self._next_stats = 0.0
 
     def run(self, signals: StopSignals) -> None:
+        # Settled first, for a recorder that runs already is to get this process's very first message.
+        self._bus.settle(SETTLE_S)
         self._send_stats(ready=False)
         try:
             signals.interrupting = True

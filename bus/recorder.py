@@ -163,28 +163,25 @@ class Recorder:
 
 
 class RecorderHandler:
-    """A recorder as a process of its own: ready once it listens; it finishes the file when it is stopped."""
+    """A recorder as a process of its own; it listens from when it is made and finishes the file when stopped."""
 
     name = "recorder"
     inputs: tuple[Topic, ...] = ()
     outputs: tuple[Topic, ...] = ()
 
     def __init__(self, bus: Bus, address: Address, path: Path | str, **options: Any) -> None:
-        self._arguments = (bus, address, path)
-        self._options = options
-        self._recorder: Recorder | None = None
+        self._recorder = Recorder(bus, address, path, **options)
 
     def start(self) -> None:
-        self._recorder = Recorder(*self._arguments, **self._options)
+        """Nothing to load."""
 
     def handle(self, topic: Topic, message: Message) -> Iterable[Output]:
         return ()
 
     def tick(self, now_ns: int) -> Iterable[Output]:
-        if self._recorder is not None and self._recorder.error is not None:
+        if self._recorder.error is not None:
             raise self._recorder.error
         return ()
 
     def stop(self) -> None:
-        if self._recorder is not None:
-            self._recorder.close()
+        self._recorder.close()

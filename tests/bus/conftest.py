@@ -71,6 +71,20 @@ def hub() -> Iterator[str]:
     processes.close()
 
 
+@pytest.fixture
+def connect() -> Iterator[Callable[[str], ZenohBus]]:
+    """Opens sessions that are closed at the end, also that of a failed test."""
+    opened: list[ZenohBus] = []
+
+    def session(address: str) -> ZenohBus:
+        opened.append(ZenohBus(address))
+        return opened[-1]
+
+    yield session
+    for bus in opened:
+        bus.close()
+
+
 @pytest.fixture(params=["memory", "zenoh"])
 def sessions(request: pytest.FixtureRequest) -> Iterator[tuple[Bus, Bus]]:
     """Two sessions of one bus."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 
 import pytest
 from support.bus_samples import ADDRESS, frame, guess, matches, view
@@ -16,6 +18,9 @@ from bus.node import EndOfInput, Handler, JoinedHandler, Output, reply_header, r
 from bus.ports import Inbox, Outbox, Received
 from bus.topics import FRAME, GUESS, MATCHES, STATS, TRUTH, VIEW, Topic
 from bus.transport import MemoryBus, ZenohBus, wait_for
+
+Connect = Callable[[str], ZenohBus]
+Spawn = Callable[..., "subprocess.Popen[str]"]
 
 
 class Matching(JoinedHandler):
@@ -205,7 +210,7 @@ class TestPlain:
             time.sleep(0.3)
             busy = list(ticks)
         for times in (idle, busy):
-            spaces = sorted(b - a for a, b in zip(times, times[1:], strict=False))
+            spaces = sorted(b - a for a, b in pairwise(times))
             assert len(times) >= 6
             assert spaces[len(spaces) // 2] < 0.04
 
@@ -361,20 +366,18 @@ class TestProcesses:
     @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
     @pytest.mark.parametrize("start_s", ["0", "60"])
     def test_a_signal_ends_it_cleanly_also_while_it_starts(
-        self, hub: str, spawn, number: int, start_s: str
+        self, hub: str, connect: Connect, spawn: Spawn, number: int, start_s: str
     ) -> None:
         process = spawn(STAGE, hub, start_s)
         assert process.stdout.readline() == "starting\n"
         if start_s == "0":
-            bus = ZenohBus(hub)
-            wait_for(bus, ADDRESS, ["tracking"], 5.0)
-            bus.close()
+            wait_for(connect(hub), ADDRESS, ["tracking"], 5.0)
         process.send_signal(number)
         out, err = process.communicate(timeout=5.0)
         assert (process.returncode, out, err) == (0, "stopped\n", "")
 
-    def test_killed_and_started_again(self, hub: str, spawn) -> None:
-        bus = ZenohBus(hub)
+    def test_killed_and_started_again(self, hub: str, connect: Connect, spawn: Spawn) -> None:
+        bus = connect(hub)
         outbox = Outbox(bus, ADDRESS, "test")
         for frame_id in (1, 2):
             process = spawn(STAGE, hub, "0")
@@ -387,7 +390,6 @@ class TestProcesses:
             while bus.live(ADDRESS.live("tracking")) and time.monotonic() < deadline:
                 time.sleep(0.01)
             assert bus.live(ADDRESS.live("tracking")) == set()
-        bus.close()
 
     def test_a_stage_that_cannot_start_ends_with_its_error(self) -> None:
         def start() -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,9 @@ from bus.recorder import RECORDED, Recorder, RecorderHandler, RecordingWriter, p
 from bus.replay import Attachment, info, read_recording
 from bus.topics import ALL, FRAME, GUESS, STATS, TRUTH, Address
 from bus.transport import Bus, MemoryBus, ZenohBus, wait_for
+
+Connect = Callable[[str], ZenohBus]
+Spawn = Callable[..., "subprocess.Popen[str]"]
 
 EVERYTHING = Address("*", "*", "*")
 
@@ -46,31 +51,6 @@ class TestLive:
             assert same(each.message, sent)
             assert each.key == ADDRESS.key(each.topic, "pnp")
             assert before_ns <= each.message.header.sent_ns <= each.log_time_ns <= time.time_ns()
-
-    def test_nothing_of_500_images_over_zenoh_is_lost(self, hub: str, path: Path) -> None:
-        sender, receiver = ZenohBus(hub), ZenohBus(hub)
-        recorder = Recorder(receiver, EVERYTHING, path, from_start=True)
-        receiver.hold(ADDRESS.live("recorder"))
-        wait_for(sender, ADDRESS, ["recorder"], 5.0)
-        outbox = Outbox(sender, ADDRESS, "camera")
-        image = frame(0, width=480, height=360)
-        for frame_id in range(500):
-            image.header = Header("", 0, frame_id, 0, frame_id, 0)
-            outbox.publish(FRAME, image)
-            outbox.publish(TRUTH, truth(frame_id))
-            time.sleep(0.005)
-        deadline = time.monotonic() + 5.0
-        while recorder.writer.messages < 1000 and time.monotonic() < deadline:
-            time.sleep(0.01)
-        assert recorder.close()
-        sender.close()
-        receiver.close()
-        facts = info(path)
-        assert [(each.topic, each.messages) for each in facts.topics] == [("frame", 500), ("truth", 500)]
-        assert [(each.source, each.received, each.written, each.missing) for each in facts.sources] == [
-            ("camera", 500, 500, 0)
-        ] * 2
-        assert facts.size_bytes > 500 * image.image.nbytes
 
     def test_gaps_make_a_recording_not_lossless(self, path: Path) -> None:
         bus = MemoryBus()
@@ -199,14 +179,37 @@ RECORD = """
 """
 
 
-class TestDeath:
+class TestProcess:
+    def test_nothing_of_500_images_is_lost(self, hub: str, path: Path, connect: Connect, spawn: Spawn) -> None:
+        process = spawn(RECORD, hub, str(path))
+        sender = connect(hub)
+        wait_for(sender, ADDRESS, ["recorder"], 10.0)
+        outbox = Outbox(sender, ADDRESS, "camera")
+        image = frame(0, width=480, height=360)
+        for frame_id in range(500):
+            image.header = Header("", 0, frame_id, 0, frame_id, 0)
+            outbox.publish(FRAME, image)
+            outbox.publish(TRUTH, truth(frame_id))
+            time.sleep(0.005)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(20.0) == 0
+        facts = info(path)
+        counts = {(each.key, each.source): (each.received, each.written, each.missing) for each in facts.sources}
+        assert counts[ADDRESS.key(FRAME), "camera"] == (500, 500, 0)
+        assert counts[ADDRESS.key(TRUTH), "camera"] == (500, 500, 0)
+        assert facts.lossless
+        assert facts.size_bytes > 500 * image.image.nbytes
+
     def publish(self, outbox: Outbox, ids: range) -> None:
         for frame_id in ids:
             outbox.publish(FRAME, frame(frame_id, width=240, height=180))
             time.sleep(0.005)
 
-    def test_a_killed_recorder_leaves_what_recover_saves(self, hub: str, path: Path, tmp_path: Path, spawn) -> None:
-        bus = ZenohBus(hub)
+    def test_a_killed_recorder_leaves_what_recover_saves(
+        self, hub: str, path: Path, tmp_path: Path, connect: Connect, spawn: Spawn
+    ) -> None:
+        bus = connect(hub)
         process = spawn(RECORD, hub, str(path))
         wait_for(bus, ADDRESS, ["recorder"], 10.0)
         outbox = Outbox(bus, ADDRESS, "camera")
@@ -225,12 +228,11 @@ class TestDeath:
         assert np.array_equal(frames[-1].message.image, frame(59, width=240, height=180).image)  # type: ignore
         assert not facts.lossless
         assert facts.metadata["run"] == {"id": "7"}
-        bus.close()
 
     def test_a_recorder_that_is_started_again_goes_on_and_knows_what_it_missed(
-        self, hub: str, path: Path, spawn
+        self, hub: str, path: Path, connect: Connect, spawn: Spawn
     ) -> None:
-        bus = ZenohBus(hub)
+        bus = connect(hub)
         outbox = Outbox(bus, ADDRESS, "camera")
         first = spawn(RECORD, hub, str(path))
         wait_for(bus, ADDRESS, ["recorder"], 10.0)
@@ -250,7 +252,6 @@ class TestDeath:
         assert (camera.received, camera.written, camera.missing) == (35, 35, 5)
         assert not facts.lossless
         assert list(path.parent.iterdir()) == [path]
-        bus.close()
 
     def test_the_handler_listens_once_it_is_ready_and_finishes_when_stopped(self, path: Path) -> None:
         bus: Bus = MemoryBus()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -16,6 +17,8 @@ from bus.topics import FRAME, GUESS, STATS, TRUTH, Address
 from bus.transport import Bus, MemoryBus, ZenohBus, serve_hub, wait_for
 
 Sessions = tuple[Bus, Bus]
+Connect = Callable[[str], ZenohBus]
+Spawn = Callable[..., "subprocess.Popen[str]"]
 
 
 def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> bool:
@@ -194,16 +197,15 @@ HUB = "import sys; from bus.transport import serve_hub; serve_hub(sys.argv[1])"
 
 
 class TestProcesses:
-    def test_a_killed_process_loses_its_token_within_a_second(self, hub: str, spawn) -> None:
-        bus = ZenohBus(hub)
+    def test_a_killed_process_loses_its_token_soon(self, hub: str, connect: Connect, spawn: Spawn) -> None:
+        bus = connect(hub)
         process = spawn(HOLDER, hub)
         wait_for(bus, ADDRESS, ["camera"], 10.0)
         process.send_signal(signal.SIGKILL)
         assert until(lambda: not bus.live(ADDRESS.live("camera")), 1.0)
-        bus.close()
 
-    def test_any_order_of_start_and_a_hub_that_dies(self, endpoint: str, spawn) -> None:
-        bus = ZenohBus(endpoint)
+    def test_any_order_of_start_and_a_hub_that_dies(self, endpoint: str, connect: Connect, spawn: Spawn) -> None:
+        bus = connect(endpoint)
         with pytest.raises(TransportError, match="no hub answers"):
             bus.wait_for_hub(0.05)
         spawn(HOLDER, endpoint)
@@ -216,15 +218,12 @@ class TestProcesses:
         time.sleep(0.2)
         second = spawn(HUB, endpoint)
         bus.wait_for_hub(10.0)
-        newcomer = ZenohBus(endpoint)
-        late = Inbox(newcomer, ADDRESS, [FRAME])
+        late = Inbox(connect(endpoint), ADDRESS, [FRAME])
         assert late.get(10.0) is not None
         inbox.drain()
         assert inbox.get(5.0) is not None
         second.terminate()
         assert second.wait(5.0) == 0
-        newcomer.close()
-        bus.close()
 
     def test_two_hubs_on_one_port_is_one_clear_line(self, hub: str) -> None:
         with pytest.raises(TransportError, match=r"no hub at .* in use") as caught:
@@ -240,7 +239,7 @@ class TestProcesses:
         with pytest.raises(TransportError):
             ZenohBus(hub, settings={"transport/nonsense": 1})
 
-    def test_zenoh_logs_to_stderr_and_prints_stay_on_stdout(self, endpoint: str, spawn) -> None:
+    def test_zenoh_logs_to_stderr_and_prints_stay_on_stdout(self, endpoint: str, spawn: Spawn) -> None:
         program = """
             import sys
             from bus.transport import ZenohBus, log_to_stderr

@@ -21,6 +21,7 @@ __all__ = ["PnpConfig", "PnpResult", "solve"]
 
 _MIN_POINTS = 4
 _ROUNDS = 3
+_LEAST_CONFIDENCE = 0.01
 _REFERENCE_SIDE_PX = 400
 
 
@@ -45,12 +46,12 @@ def solve(
     points_in_object: np.ndarray,
     camera: Camera,
     config: PnpConfig | None = None,
-    weights: np.ndarray | None = None,
+    confidence: np.ndarray | None = None,
 ) -> PnpResult:
     """The camera's pose from pixels (n, 2), distorted as the camera has them, and points (n, 3) in the object.
 
-    weights (n,), of the squared errors, count in the refinement and not in RANSAC. The same input gives the same
-    result. Never raises for data that hold no pose: the result says why.
+    confidence (n,), relative to each other, counts in the refinement and not in RANSAC. The same input gives the
+    same result. Never raises for data that hold no pose: the result says why.
     """
     config = config or PnpConfig()
     if len(pixels_in_frame) < max(config.min_inliers, _MIN_POINTS):
@@ -63,7 +64,9 @@ def solve(
     start = _ransac(pixels, points, plain, threshold, config)
     if start is None:
         return _failed("no_consensus", len(pixels))
-    weights = np.ones(len(pixels)) if weights is None else weights.astype(np.float64)
+    weights = np.ones(len(pixels))
+    if confidence is not None:
+        weights = np.maximum(confidence.astype(np.float64), _LEAST_CONFIDENCE) ** config.confidence_power
     fit, inliers = _polish(pixels, points, plain, start, weights, threshold, config)
     if fit is None or inliers.sum() < config.min_inlier_ratio * len(pixels):
         return _failed("no_consensus", len(pixels))

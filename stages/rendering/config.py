@@ -13,9 +13,11 @@ class RenderingConfig:
     """longer side of a view in pixels; never more than the frame's"""
     min_visible: float = 0.002
     """a view whose pixels show the object to a smaller share is reported as a failure"""
-    reuse_angle_deg: float = 1.0
+    reuse_angle_deg: float = 5.0
     """a cached view is used again if surface points are seen from directions that differ by no more; 0: never"""
-    reuse_shift: float = 0.02
+    reuse_shift: float = 0.1
     """and if they are shifted by no more than this share of the image's longer side (root mean square)"""
+    next_pass_share: float = 0.2
+    """a next pass over the same frame wants a view that is nearer than the last: its share of the two limits"""
     cache_mb: float = 64.0
     """memory for cached views; the longest unused ones are forgotten"""

@@ -34,10 +34,10 @@ class ViewSource:
         self._renderer, self._config, self._field_id = renderer, config or RenderingConfig(), field_id
         self._cache: OrderedDict[str, _Cached] = OrderedDict()
 
-    def view(self, camera: Camera, cam_from_object: np.ndarray) -> SourcedView:
-        """The view of a frame's camera (distortion left out, shrunk) at the guess or near it."""
+    def view(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool = False) -> SourcedView:
+        """The view of a frame's camera (distortion left out, shrunk) at the guess or near it; nearer in a next pass."""
         small = view_camera(camera, self._config.size)
-        found = self._near(small, cam_from_object)
+        found = self._near(small, cam_from_object, self._config.next_pass_share if next_pass else 1.0)
         if found is not None:
             self._cache.move_to_end(found)
             cached = self._cache[found]
@@ -48,15 +48,15 @@ class ViewSource:
         self._keep(view_id, cached)
         return SourcedView(view, view_id, False, cached.visible)
 
-    def _near(self, camera: Camera, cam_from_object: np.ndarray) -> str | None:
-        """The id of the cached view with the smallest shift among those near enough."""
+    def _near(self, camera: Camera, cam_from_object: np.ndarray, share: float) -> str | None:
+        """The id of the cached view with the smallest shift among those within a share of the limits."""
         if self._config.reuse_angle_deg <= 0:
             return None
-        best, best_shift = None, self._config.reuse_shift
+        best, best_shift = None, share * self._config.reuse_shift
         for view_id, cached in self._cache.items():
             if cached.view.camera == camera:
                 angle_deg, shift = _difference(cached, cam_from_object)
-                if angle_deg <= self._config.reuse_angle_deg and shift <= best_shift:
+                if angle_deg <= share * self._config.reuse_angle_deg and shift <= best_shift:
                     best, best_shift = view_id, shift
         return best
 

@@ -1,0 +1,131 @@
+"""From a perturbed guess to a pose, through the nodes of rendering, matching, lifting, pnp and refinement."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from support.analytic_scene import AnalyticScene, camera, viewpoint
+from support.chain import frame_message, guess_message, run_chain
+
+from bus.messages import Reason
+from bus.topics import CORRESPONDENCES, ESTIMATE, FRAME, MATCHES, POSE, VIEW
+from stages.geometry import perturb, rays, rotation_error_deg, translation_error
+from stages.lifting.config import LiftingConfig
+from stages.lifting.node import LiftingNode
+from stages.matching.core import MatchingConfig
+from stages.matching.node import MatchingNode
+from stages.pnp.config import PnpConfig
+from stages.pnp.node import PnpNode
+from stages.refinement.core import RefinementConfig
+from stages.refinement.node import RefinementNode
+from stages.rendering.config import RenderingConfig
+from stages.rendering.node import RenderingNode
+
+LENS = camera(220, (-0.1, 0.02, 0.001, -0.001, 0.0))
+POSE_TRUE = viewpoint(30.0, 40.0)
+
+
+@pytest.fixture(scope="module")
+def scene() -> AnalyticScene:
+    return AnalyticScene()
+
+
+@pytest.fixture(scope="module")
+def image(scene: AnalyticScene) -> np.ndarray:
+    rgb = scene.render_rays(*rays(LENS, POSE_TRUE)).rgb.reshape(LENS.height, LENS.width, 3)
+    return np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+
+
+@pytest.fixture
+def make_nodes(monkeypatch: pytest.MonkeyPatch, scene: AnalyticScene, tmp_path: Path) -> Any:
+    field = tmp_path / "field.safetensors"
+    field.write_bytes(b"stands for a field")
+    for stage in ("rendering", "lifting", "refinement"):
+        monkeypatch.setattr(f"stages.{stage}.node.load_renderer", lambda path, threads: scene)
+
+    def make(refinement: RefinementConfig | None = None, lifting: LiftingConfig | None = None) -> list[Any]:
+        nodes = [
+            RenderingNode(field, RenderingConfig(size=220)),
+            MatchingNode(MatchingConfig(matcher="sift")),
+            LiftingNode(field, lifting or LiftingConfig()),
+            PnpNode(PnpConfig()),
+            RefinementNode(field, refinement or RefinementConfig(samples=300, held_out=150)),
+        ]
+        for node in nodes:
+            node.start()
+        return nodes
+
+    return make
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_perturbed_guess_leads_to_the_pose(make_nodes: Any, image: np.ndarray, seed: int) -> None:
+    guess = perturb(POSE_TRUE, np.random.default_rng(seed), (10.0, 20.0), 0.2)
+    said = run_chain(make_nodes(), frame_message(image, LENS), guess_message(guess, LENS))
+    assert all(said[topic].ok for topic in (VIEW, MATCHES, CORRESPONDENCES, ESTIMATE, POSE))  # type: ignore[attr-defined]
+    estimate, pose = said[ESTIMATE], said[POSE]
+    assert rotation_error_deg(estimate.cam_from_object, POSE_TRUE) < 1.0  # type: ignore[attr-defined]
+    assert rotation_error_deg(pose.cam_from_object, POSE_TRUE) < 0.2  # type: ignore[attr-defined]
+    assert translation_error(pose.cam_from_object, POSE_TRUE) < 0.02  # type: ignore[attr-defined]
+    assert pose.refined  # type: ignore[attr-defined]
+    assert pose.loss_after < pose.loss_before  # type: ignore[attr-defined]
+    assert pose.inliers <= pose.correspondences  # type: ignore[attr-defined]
+    assert said[CORRESPONDENCES].camera == said[FRAME].camera  # type: ignore[attr-defined]
+    assert pose.header.frame_id == 1
+
+
+def test_a_replayed_frame_gets_the_same_pose(make_nodes: Any, image: np.ndarray) -> None:
+    guess = perturb(POSE_TRUE, np.random.default_rng(2), (5.0, 10.0), 0.1)
+    first, second = (
+        run_chain(make_nodes(), frame_message(image, LENS), guess_message(guess, LENS))[POSE] for _ in range(2)
+    )
+    assert np.array_equal(first.cam_from_object, second.cam_from_object)  # type: ignore[attr-defined]
+
+
+def test_refinement_switched_off_hands_the_estimate_on_without_the_frame(
+    make_nodes: Any, image: np.ndarray
+) -> None:
+    nodes = make_nodes(RefinementConfig(steps=0))
+    assert nodes[-1].inputs == (ESTIMATE,)
+    said = run_chain(nodes, frame_message(image, LENS), guess_message(POSE_TRUE, LENS))
+    assert np.array_equal(said[POSE].cam_from_object, said[ESTIMATE].cam_from_object)  # type: ignore[attr-defined]
+    assert not said[POSE].refined  # type: ignore[attr-defined]
+
+
+def failed(said: dict[Any, Any]) -> list[Any]:
+    return [said[topic].reason for topic in (VIEW, MATCHES, CORRESPONDENCES, ESTIMATE, POSE) if not said[topic].ok]
+
+
+def test_a_guess_that_sees_nothing_fails_all_the_way_down(make_nodes: Any, image: np.ndarray) -> None:
+    away = np.diag([1.0, -1.0, -1.0, 1.0]) @ POSE_TRUE
+    said = run_chain(make_nodes(), frame_message(image, LENS), guess_message(away, LENS))
+    assert failed(said) == [Reason.NOTHING_IN_VIEW] * 5
+    assert said[POSE].cam_from_object is None  # type: ignore[attr-defined]
+
+
+def test_a_blank_frame_has_too_few_matches(make_nodes: Any, image: np.ndarray) -> None:
+    said = run_chain(make_nodes(), frame_message(np.zeros_like(image), LENS), guess_message(POSE_TRUE, LENS))
+    assert failed(said) == [Reason.TOO_FEW_MATCHES] * 4
+
+
+def test_a_gamma_that_nothing_meets_leaves_too_few_points(make_nodes: Any, image: np.ndarray) -> None:
+    nodes = make_nodes(lifting=LiftingConfig(gamma=1e-9))
+    said = run_chain(nodes, frame_message(image, LENS), guess_message(POSE_TRUE, LENS))
+    assert failed(said) == [Reason.TOO_FEW_CONSISTENT_POINTS] * 3
+
+
+def test_a_missing_frame_is_said_to_be_missing(make_nodes: Any) -> None:
+    assert failed(run_chain(make_nodes(), None, guess_message(POSE_TRUE, LENS))) == [Reason.FRAME_MISSING] * 4
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+def test_encoded_frames_are_read_and_damaged_ones_reported(make_nodes: Any, image: np.ndarray, suffix: str) -> None:
+    encoding = {".jpg": "jpeg", ".png": "png"}[suffix]
+    payload = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].ravel()
+    guess = guess_message(POSE_TRUE, LENS)
+    said = run_chain(make_nodes(), frame_message(payload, LENS, encoding=encoding), guess)
+    assert rotation_error_deg(said[POSE].cam_from_object, POSE_TRUE) < 0.2  # type: ignore[attr-defined]
+    said = run_chain(make_nodes(), frame_message(payload[:20], LENS, encoding=encoding), guess)
+    assert failed(said) == [Reason.FRAME_UNREADABLE] * 4

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from stages.nerf.field import LEARNT
 from stages.nerf.kernels.adam import adam_step
 from stages.nerf.kernels.train import Gradients
 from stages.nerf.kernels.types import Net
-from stages.nerf.workers import Workers
+from stages.nerf.workers import Scratch, Workers
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 """Instant-NGP's settings."""
@@ -37,11 +38,21 @@ class Optimiser:
         for name in LEARNT:
             parameter = getattr(self.net, name).reshape(-1)
             gradients = tuple(getattr(g, name).reshape(-1) for g in self.gradients)
-            mean, square = self._moments[name]
-            sparse = name == "table"
-
-            def update(_: object, first: int, last: int, args: tuple = (parameter, gradients, mean, square, sparse)):  # noqa: B023
-                p, g, m, v, skip = args
-                adam_step(p, g, m, v, first, last, corrected, BETA1, BETA2, EPSILON, skip)
-
+            update = partial(
+                self._update, parameter, gradients, *self._moments[name], rate=corrected, sparse=name == "table"
+            )
             workers.each(len(parameter), 1 << 18, update)
+
+    def _update(
+        self,
+        parameter: np.ndarray,
+        gradients: tuple[np.ndarray, ...],
+        mean: np.ndarray,
+        square: np.ndarray,
+        _: Scratch,
+        first: int,
+        last: int,
+        rate: float,
+        sparse: bool,
+    ) -> None:
+        adam_step(parameter, gradients, mean, square, first, last, rate, BETA1, BETA2, EPSILON, sparse)

@@ -47,7 +47,7 @@ class RayBank:
         self._origin = ((centres - np.array(space.centre)) / space.scale).astype(np.float32)
 
     def draw(self, rng: np.random.Generator, count: int) -> Batch:
-        """A random batch; where the surface leaves a pixel open, a random background shows, so that opacity is learnt."""
+        """A random batch; behind transparent pixels lies a random background, so that opacity is learnt."""
         flat = rng.integers(0, len(self._pixels), count)
         image = np.searchsorted(self._starts, flat, side="right") - 1
         in_cam = self._directions[self._map_start[image] + flat - self._starts[image]]

@@ -9,7 +9,7 @@ from stages.geometry.cameras import Camera
 from stages.nerf.field import Field
 from stages.nerf.normalise import by_object_rays, normalised, tile_view
 from stages.nerf.rendering_api import RenderedRays, RenderedView
-from stages.nerf.twin import TwinField, twin_of
+from stages.nerf.twin import TwinField, TwinRays, twin_of
 
 CHUNK = 4096
 
@@ -54,7 +54,7 @@ class TorchRenderer:
         """See RayRenderer."""
         return tile_view(self.render_rays, camera, cam_from_object)
 
-    def _trace(self, o: torch.Tensor, d: torch.Tensor):  # noqa: ANN202
+    def _trace(self, o: torch.Tensor, d: torch.Tensor) -> TwinRays:
         jitter = torch.full((len(o),), 0.5, device=o.device)
         with torch.no_grad():
             samples = self._twin.march(o, d, jitter)

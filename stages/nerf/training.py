@@ -64,7 +64,8 @@ class Trainer:
     def step(self, fraction: float) -> float:
         """One batch at a `fraction` 0..1 of the schedule; returns its mean squared error."""
         config = self.config
-        if self.optimiser.steps % (OCCUPANCY_EVERY if self.optimiser.steps < SETTLED else 4 * OCCUPANCY_EVERY) == 0:
+        every = OCCUPANCY_EVERY if self.optimiser.steps < SETTLED else 4 * OCCUPANCY_EVERY
+        if self.optimiser.steps % every == 0:
             self.update_occupancy()
         rate = config.learning_rate * (config.final_learning_rate / config.learning_rate) ** fraction
         n = self._rays
@@ -74,7 +75,8 @@ class Trainer:
         done = self.workers.split(
             n,
             lambda s, a, b: train(
-                self.net, self._domain, batch.origins, batch.directions, jitter, batch.background, batch.target, a, b,
+                self.net, self._domain, batch.origins, batch.directions, jitter, batch.background, batch.target,
+                a, b,
                 PER_RAY, STOP_BELOW, np.float32(config.huber_delta), np.float32(config.distortion), scale,
                 s.samples, s.rays, self.optimiser.gradients[s.index],
             ),

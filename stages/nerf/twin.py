@@ -41,6 +41,14 @@ class TwinRays:
 class TwinField(nn.Module):
     """A field whose learnt arrays are torch parameters."""
 
+    table: Tensor
+    w1: Tensor
+    w2: Tensor
+    c1: Tensor
+    c2: Tensor
+    c3: Tensor
+    occupied: Tensor
+
     def __init__(self, net: Net, space: Space, occupied: np.ndarray, device: torch.device | str = "cpu"):
         super().__init__()
         self.space = space
@@ -53,7 +61,7 @@ class TwinField(nn.Module):
     @property
     def device(self) -> torch.device:
         """Where the parameters are."""
-        return self.table.device  # type: ignore[return-value]
+        return self.table.device
 
     def to_cube(self, y: Tensor) -> tuple[Tensor, Tensor]:
         """(…, 3) normalised coordinates to the unit cube, and the growth (…,) of the step with distance."""
@@ -70,7 +78,7 @@ class TwinField(nn.Module):
             scaled = u * resolution
             index = scaled.detach().long().clamp(0, resolution - 1)
             fraction = scaled - index
-            total = 0
+            total = u.new_zeros(len(u), self.table.shape[1])
             for corner in range(8):
                 bits = torch.tensor([corner & 1, corner >> 1 & 1, corner >> 2], device=u.device)
                 x, y, z = (index + bits).unbind(-1)
@@ -93,9 +101,9 @@ class TwinField(nn.Module):
 
     def is_occupied(self, u: Tensor) -> Tensor:
         """(…, 3) in the unit cube to (…,) bool."""
-        n = self.occupied.shape[0]  # type: ignore[union-attr,index]
+        n = self.occupied.shape[0]
         x, y, z = (u * n).long().clamp(0, n - 1).unbind(-1)
-        return self.occupied[z, y, x]  # type: ignore[index]
+        return self.occupied[z, y, x]
 
     def march(self, origins: Tensor, directions: Tensor, jitter: Tensor) -> TwinSamples:
         """Every step of every ray within the domain, valid where its cell is occupied; unit directions."""

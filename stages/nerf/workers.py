@@ -99,7 +99,7 @@ class Workers:
         lock = Lock()
 
         def run(scratch: Scratch) -> list[object]:
-            results = []
+            results: list[object] = []
             while True:
                 with lock:
                     first = next(starts)

@@ -35,7 +35,7 @@ class ViewSource:
         self._cache: OrderedDict[str, _Cached] = OrderedDict()
 
     def view(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool = False) -> SourcedView:
-        """The view of a frame's camera (distortion left out, shrunk) at the guess or near it; nearer in a next pass."""
+        """The view of a frame's camera (undistorted, shrunk) at the guess or near it; nearer in a next pass."""
         small = view_camera(camera, self._config.size)
         found = self._near(small, cam_from_object, self._config.next_pass_share if next_pass else 1.0)
         if found is not None:

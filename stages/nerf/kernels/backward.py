@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from stages.nerf.kernels.packet import MAX_EXPONENT
-from stages.nerf.kernels.types import FASTMATH, SH_SIZE, Net, Rays, Samples
+from stages.nerf.kernels.types import FASTMATH, Net, Rays, Samples
 
 
 @njit(nogil=True, fastmath=FASTMATH)

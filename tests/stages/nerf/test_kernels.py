@@ -20,10 +20,13 @@ from stages.nerf.workers import Workers
 BOX = Space(False, (0.1, -0.2, 0.3), 1.5, half=(1.0, 0.8, 0.9), step=0.03)
 BALL = Space(True, (0.1, -0.2, 0.3), 1.5, near=0.05, far=20.0, step=0.06)
 CONFIGS = {
-    "wide": FieldConfig(levels=3, level_features=4, log2_table=9, finest_resolution=64, hidden=16, features=6,
-                        colour_hidden=8, occupancy_resolution=16),
-    "narrow": FieldConfig(levels=5, level_features=2, log2_table=8, base_resolution=4, finest_resolution=50, hidden=8,
-                          features=3, colour_hidden=16, occupancy_resolution=8),
+    "wide": FieldConfig(
+        levels=3, log2_table=9, finest_resolution=64, hidden=16, features=6, colour_hidden=8, occupancy_resolution=16
+    ),
+    "narrow": FieldConfig(
+        levels=5, level_features=2, log2_table=8, base_resolution=4, finest_resolution=50, hidden=8, features=3,
+        colour_hidden=16, occupancy_resolution=8,
+    ),
 }  # fmt: skip
 
 
@@ -120,7 +123,7 @@ def test_training_gradients_as_the_twin(space: Space, name: str) -> None:
     loss = torch.nn.functional.huber_loss(rays.rgb, torch.tensor(target), reduction="sum", delta=delta) * scale
     loss = loss + distortion * scale * distortion_loss(samples, rays.weights, space.contracted)
     loss.backward()
-    assert squared == pytest.approx(float((error**2).sum()), rel=0.02)
+    assert squared == pytest.approx(float((error.detach() ** 2).sum()), rel=0.02)
     for n in Gradients._fields:
         fast, slow = getattr(grads, n).ravel(), getattr(twin, n).grad.numpy().ravel()
         assert np.linalg.norm(fast - slow) < 0.03 * np.linalg.norm(slow), n

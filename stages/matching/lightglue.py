@@ -159,7 +159,7 @@ def _lightglue_name(name: str) -> str | None:
 
 
 def _tensor(image: np.ndarray, device: str) -> torch.Tensor:
-    return torch.from_numpy(image).to(device).permute(2, 0, 1)[None].float() / 255
+    return torch.from_numpy(np.array(image)).to(device).permute(2, 0, 1)[None].float() / 255
 
 
 def _masked(pixels: np.ndarray, descriptors: torch.Tensor, image: np.ndarray, mask: np.ndarray | None) -> Features:

@@ -6,6 +6,7 @@ kornia's.
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import cv2
@@ -13,6 +14,7 @@ import numpy as np
 import torch
 from kornia.core.download import hf_url
 from kornia.feature import LoFTR
+from kornia.feature.loftr.loftr import default_cfg
 
 from stages.matching.core import Features, MatchedPixels, MatchingConfig
 from stages.matching.weights import WeightsFile, find_weights, load_network
@@ -29,8 +31,11 @@ class LoFTRMatcher:
 
     def __init__(self, config: MatchingConfig) -> None:
         path = find_weights(WEIGHTS, config.weights, config.allow_download)
-        self._network: Any = load_network(LoFTR(None), path, config.device, _name_in_network)
-        self._min_confidence, self._device = config.min_confidence or 0.0, config.device
+        settings: Any = copy.deepcopy(default_cfg)
+        if config.min_confidence is not None:
+            settings["match_coarse"]["thr"] = config.min_confidence
+        self._network: Any = load_network(LoFTR(None, settings), path, config.device, _name_in_network)
+        self._device = config.device
 
     @torch.inference_mode()
     def extract(self, image: np.ndarray, mask: np.ndarray | None = None) -> Features:
@@ -47,8 +52,7 @@ class LoFTRMatcher:
         in_view = found["keypoints0"].cpu().numpy().astype(np.float32) - _PIXEL_CENTRE
         in_frame = found["keypoints1"].cpu().numpy().astype(np.float32) - _PIXEL_CENTRE
         confidence = found["confidence"].cpu().numpy().astype(np.float32)
-        good = confidence >= self._min_confidence
-        good &= _inside(in_view, view.size, view_mask) & _inside(in_frame, frame.size, frame_mask)
+        good = _inside(in_view, view.size, view_mask) & _inside(in_frame, frame.size, frame_mask)
         return MatchedPixels(in_view[good], in_frame[good], np.clip(confidence[good], 0, 1))
 
 

@@ -49,7 +49,7 @@ class XFeatExtractor:
         return Features(pixels.cpu().numpy(), (width, height), functional.normalize(descriptors, dim=1))
 
     def _padded(self, image: np.ndarray) -> torch.Tensor:
-        grey = torch.from_numpy(image).to(self._device).permute(2, 0, 1).float().mean(0)[None, None] / 255
+        grey = torch.from_numpy(np.array(image)).to(self._device).permute(2, 0, 1).float().mean(0)[None, None] / 255
         bottom, right = (-image.shape[0]) % _STRIDE, (-image.shape[1]) % _STRIDE
         return functional.pad(grey, (0, right, 0, bottom), mode="replicate")
 

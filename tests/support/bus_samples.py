@@ -43,9 +43,7 @@ def scores(count: int) -> np.ndarray:
 def frame(frame_id: int = 0, width: int = 6, height: int = 4, header: Header | None = None) -> Frame:
     image = np.random.default_rng(frame_id).integers(0, 256, (height, width, 3), dtype=np.uint8)
     camera = CameraModel(width, height, 5.0, 5.0, 2.5, 1.5)
-    return Frame(
-        header=header or first_header(frame_id, 1000 + frame_id), image=image, encoding="rgb8", camera=camera
-    )
+    return Frame(header=header or first_header(frame_id, 1000 + frame_id), image=image, encoding="rgb8", camera=camera)
 
 
 def truth(frame_id: int = 0) -> Truth:

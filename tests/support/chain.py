@@ -17,9 +17,7 @@ from stages.wire import camera_model
 
 def frame_message(image: np.ndarray, camera: Camera, frame_id: int = 1, encoding: Any = "rgb8") -> Frame:
     """A frame as the camera sends it."""
-    return Frame(
-        header=first_header(frame_id, frame_id), image=image, encoding=encoding, camera=camera_model(camera)
-    )
+    return Frame(header=first_header(frame_id, frame_id), image=image, encoding=encoding, camera=camera_model(camera))
 
 
 def guess_message(cam_from_object: np.ndarray, camera: Camera, frame_id: int = 1, pass_index: int = 0) -> Guess:

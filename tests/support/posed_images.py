@@ -83,9 +83,7 @@ def edit_frame(path: Path, index: int, **changes: Any) -> None:
     write_json(path, content)
 
 
-def write_blender(
-    root: Path, camera: Camera, channels: int = 4, counts: Sequence[int] = (6, 3)
-) -> list[np.ndarray]:
+def write_blender(root: Path, camera: Camera, channels: int = 4, counts: Sequence[int] = (6, 3)) -> list[np.ndarray]:
     """Like NeRF-synthetic: the angle of view only, no extensions. Returns the poses, those for training first."""
     poses = poses_around(sum(counts))
     start = 0
@@ -134,8 +132,6 @@ def write_llff(root: Path, camera: Camera, count: int = 10, factors: Sequence[in
     for factor in factors:
         small = camera.resized(camera.width // factor, camera.height // factor)
         for i, pose in enumerate(poses):
-            save(
-                root / ("images" if factor == 1 else f"images_{factor}") / f"image{i:03d}.png", picture(small, pose)
-            )
+            save(root / ("images" if factor == 1 else f"images_{factor}") / f"image{i:03d}.png", picture(small, pose))
     np.save(root / "poses_bounds.npy", llff_table(poses, camera, (3.0, 30.0)))
     return poses

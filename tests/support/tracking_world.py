@@ -86,9 +86,7 @@ class World:
             covariance = np.diag([1e-4] * 3 + [1e-5] * 3)
             return PoseResult(*ids, True, exp_se3(error) @ truth, covariance, int(150 * (1.2 - off)), 200, 1.0)
         if rng.random() < 0.2:
-            return PoseResult(
-                *ids, True, perturb(guess, rng, (20, 90), 1.0), None, int(rng.integers(6, 15)), 120, 3.0
-            )
+            return PoseResult(*ids, True, perturb(guess, rng, (20, 90), 1.0), None, int(rng.integers(6, 15)), 120, 3.0)
         return PoseResult(*ids, False)
 
     def states(self, since_s: float = 0.0, until_s: float = 1e9) -> list[TrackingState]:

@@ -62,9 +62,7 @@ def decode_header(payload: bytes) -> Header:
 
     Raises CodecError where the bytes do not begin with a header, as every encoded message does.
     """
-    unpacker = msgpack.Unpacker(
-        raw=False, strict_map_key=True, max_array_len=0, max_map_len=_MAX_MAP, max_str_len=256
-    )
+    unpacker = msgpack.Unpacker(raw=False, strict_map_key=True, max_array_len=0, max_map_len=_MAX_MAP, max_str_len=256)
     unpacker.feed(payload[:_HEADER_BYTES])
     try:
         unpacker.read_map_header()

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from bus.protocol import Closer, Closing, Sink, Watcher
+from bus.protocol import Closer, Closing, Sink, Watcher, key_matches
 from bus.topics import Topic
 
 T = TypeVar("T")
@@ -33,7 +33,7 @@ class MemoryBus:
 
     def put(self, key: str, payload: bytes, topic: Topic | None = None) -> None:
         with self._room.lock:
-            sinks = [sink for pattern, sink in self._room.sinks if _matches(pattern, key)]
+            sinks = [sink for pattern, sink in self._room.sinks if key_matches(pattern, key)]
         now_ns = time.time_ns()
         for sink in sinks:
             sink(key, payload, now_ns)
@@ -49,7 +49,7 @@ class MemoryBus:
 
     def live(self, key: str) -> set[str]:
         with self._room.lock:
-            return {token for token in self._room.tokens if _matches(key, token)}
+            return {token for token in self._room.tokens if key_matches(key, token)}
 
     def watch(self, key: str, watcher: Watcher) -> Closing:
         with self._room.lock:
@@ -77,15 +77,10 @@ class MemoryBus:
 
     def _tell(self, key: str, alive: bool) -> None:
         for pattern, watcher in list(self._room.watchers):
-            if _matches(pattern, key):
+            if key_matches(pattern, key):
                 watcher(key, alive)
 
     def _closer(self, action: Callable[[], None]) -> Closing:
         closer = Closer(action)
         self._mine.append(closer)
         return closer
-
-
-def _matches(pattern: str, key: str) -> bool:
-    parts, others = pattern.split("/"), key.split("/")
-    return len(parts) == len(others) and all(a in ("*", b) for a, b in zip(parts, others, strict=True))

@@ -181,9 +181,7 @@ class _Node:
         joins = isinstance(self._handler, JoinedHandler)
         capacities = {topic: kept(topic) for topic in self._handler.inputs} if joins else None
         self._inbox = Inbox(self._bus, self._address, self._handler.inputs, capacities, self._refused)
-        if not self._bus.settle(
-            SETTLE_S, images=any(topic.priority == "data_low" for topic in self._handler.outputs)
-        ):
+        if not self._bus.settle(SETTLE_S, images=any(topic.priority == "data_low" for topic in self._handler.outputs)):
             self._throttle.warning("someone on the bus does not answer")
         token = self._bus.hold(self._address.live(self._handler.name))
         try:

@@ -29,7 +29,7 @@ class Bus(Protocol):
     """Bytes by key, and tokens that live as long as their process; a "*" in a key listens to any one part."""
 
     def put(self, key: str, payload: bytes, topic: Topic | None = None) -> None:
-        """Send with the topic's priority; nobody says whether it was received."""
+        """Send with the topic's priority, or without one ahead of every topic; nobody says whether it was received."""
 
     def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:
         """Give what arrives to `sink`; while that is held up, `capacity` messages wait (1: the newest)."""
@@ -90,3 +90,9 @@ def wait_for(bus: Bus, address: Address, stages: Iterable[str], timeout_s: float
         bus.settle(max(SETTLE_S, deadline - time.monotonic()))
         return
     raise TransportError(f"not ready on the bus after {timeout_s:g} s: {missing}; is each of them running?")
+
+
+def key_matches(pattern: str, key: str) -> bool:
+    """Whether a concrete key is one that `pattern` listens to."""
+    parts, others = pattern.split("/"), key.split("/")
+    return len(parts) == len(others) and all(a in ("*", b) for a, b in zip(parts, others, strict=True))

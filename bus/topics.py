@@ -64,11 +64,7 @@ class Topic:
     def address_of(self, key: str) -> Address | None:
         """The pipeline that a concrete key of this topic belongs to; None where it is another topic's key."""
         found = re.fullmatch(self.template.format(**_GROUPS), key)
-        return (
-            Address(**{name: part for name, part in found.groupdict().items() if name != "stage"})
-            if found
-            else None
-        )
+        return Address(**{name: part for name, part in found.groupdict().items() if name != "stage"}) if found else None
 
 
 _GROUPS = {name: f"(?P<{name}>{_PART_OF_KEY})" for name in ("site", "object", "camera", "stage")}

@@ -15,8 +15,8 @@ from typing import Any
 import zenoh
 
 from bus.errors import TransportError
-from bus.greeting import Greeter
 from bus.memory import MemoryBus
+from bus.presence import Presence
 from bus.protocol import Bus, Closer, Closing, Sink, Watcher, wait_for
 from bus.signals import StopSignals
 from bus.topics import Topic
@@ -64,7 +64,7 @@ class ZenohBus:
         self._publishers: dict[str, Any] = {}
         self._declaring = threading.Lock()
         self._mine: list[Closer] = []
-        self._greeter = Greeter(self, str(self._session.zid()))
+        self._presence = self._open_presence(str(self._session.zid()))
 
     def wait_for_hub(self, timeout_s: float) -> None:
         """Return once the hub answers. Raises TransportError after `timeout_s`."""
@@ -81,10 +81,8 @@ class ZenohBus:
             with self._declaring:
                 publisher = self._publishers.get(key)
                 if publisher is None:
-                    priority = _PRIORITIES[topic.priority if topic is not None else "data"]
-                    publisher = self._session.declare_publisher(
-                        key, priority=priority, congestion_control=_CONGESTION
-                    )
+                    priority = _PRIORITIES[topic.priority] if topic is not None else zenoh.Priority.INTERACTIVE_HIGH
+                    publisher = self._session.declare_publisher(key, priority=priority, congestion_control=_CONGESTION)
                     self._publishers[key] = publisher
             publisher.put(payload)
         except zenoh.ZError as error:
@@ -104,25 +102,34 @@ class ZenohBus:
         return self._closer(end)
 
     def hold(self, key: str) -> Closing:
-        return self._closer(self._session.liveliness().declare_token(key).undeclare)
+        return self._presence.hold(key)
 
     def live(self, key: str) -> set[str]:
-        replies = self._session.liveliness().get(key, timeout=1.0)
-        return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+        return self._presence.live(key)
 
     def watch(self, key: str, watcher: Watcher) -> Closing:
-        def changed(sample: Any) -> None:
-            watcher(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
-
-        return self._closer(self._session.liveliness().declare_subscriber(key, changed, history=True).undeclare)
+        return self._presence.watch(key, watcher)
 
     def settle(self, timeout_s: float, images: bool = False) -> bool:
-        return self._greeter.settle(timeout_s, images)
+        return self._presence.settle(timeout_s, images)
 
     def close(self) -> None:
         for closer in self._mine:
             closer.close()
         self._session.close()
+
+    def _open_presence(self, name: str) -> Presence:
+        presence = Presence(name, lambda word: self.put(f"peers/{name}", word))
+        self.subscribe("peers/*", lambda key, payload, _: presence.heard(key.rsplit("/", 1)[1], payload), 256)
+
+        def changed(event: Any) -> None:
+            if event.transport.whatami == zenoh.WhatAmI.PEER:
+                up = event.kind == zenoh.SampleKind.PUT
+                (presence.linked if up else presence.lost)(str(event.transport.zid))
+
+        events = self._session.info.declare_transport_events_listener(changed, history=True)
+        self._mine.append(Closer(events.undeclare))
+        return presence
 
     def _closer(self, action: Callable[[], None]) -> Closing:
         closer = Closer(action)

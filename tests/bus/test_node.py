@@ -230,9 +230,7 @@ class TestPlain:
         assert handler.stopped == 1
         assert bus.live(ADDRESS.live("*")) == set()
 
-    def test_rubbish_on_the_wire_is_counted_logged_once_and_survived(
-        self, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_rubbish_on_the_wire_is_counted_logged_once_and_survived(self, capsys: pytest.CaptureFixture[str]) -> None:
         bus = MemoryBus()
         numbers, handled = listen(bus, STATS), []
 

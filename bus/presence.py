@@ -1,0 +1,161 @@
+"""Who is on the bus, and whether messages pass: liveliness tokens carried as messages over the links themselves.
+
+Zenoh tells of its own tokens by way of the hub too, before two peers have a link, so what is sent on seeing one can be
+lost; and one in fifty that were declared while a link came up was never seen at all (1.10.2). Here each session says
+which tokens it holds when that changes and when it is greeted, and it is greeted when a link to it comes up. So who
+knows of a token knows the subscriptions behind it too. A token ends with the link to its holder: at once where that
+process is killed, after the lease where its host is gone.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Annotated
+
+import msgspec
+
+from bus.errors import TransportError
+from bus.protocol import SETTLE_S, Closer, Closing, Watcher, key_matches
+
+_Key = Annotated[str, msgspec.Meta(max_length=512)]
+_PAUSES_S = (0.02, 0.32)
+# More than the size from which a message goes through shared memory, which takes a while to set up the first time.
+_IMAGE_BYTES = 8192
+MAX_BYTES = 64 << 10
+
+
+class _Word(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What its sender holds; with a number and no addressee a greeting, with both an answer to one."""
+
+    held: Annotated[tuple[_Key, ...], msgspec.Meta(max_length=64)]
+    number: int = 0
+    to: str = ""
+
+
+class Presence:
+    """The tokens held on the bus as the session `name` knows them; `send` reaches every session that has a link."""
+
+    def __init__(self, name: str, send: Callable[[bytes], None]) -> None:
+        self._name = name
+        self._send = send
+        self._changed = threading.Condition(threading.RLock())
+        self._mine: list[str] = []
+        self._theirs: dict[str, frozenset[str]] = {}
+        self._answers: dict[str, int] = {}
+        self._seen: set[str] = set()
+        self._watchers: list[tuple[str, Watcher]] = []
+        self._number = 0
+        self._greeting = self._greet_again = False
+
+    def hold(self, key: str) -> Closing:
+        with self._changed:
+            self._mine.append(key)
+            self._tell()
+        self._send(self._word())
+
+        def release() -> None:
+            with self._changed:
+                self._mine.remove(key)
+                self._tell()
+            with suppress(TransportError):
+                self._send(self._word())
+
+        return Closer(release)
+
+    def live(self, key: str) -> set[str]:
+        with self._changed:
+            return {token for token in self._seen if key_matches(key, token)}
+
+    def watch(self, key: str, watcher: Watcher) -> Closing:
+        entry = (key, watcher)
+        with self._changed:
+            for token in sorted(self.live(key)):
+                watcher(token, True)
+            self._watchers.append(entry)
+
+        def end() -> None:
+            with self._changed:
+                self._watchers.remove(entry)
+
+        return Closer(end)
+
+    def settle(self, timeout_s: float, images: bool = False) -> bool:
+        """Greet until every session that has a link has answered; False where some did not in time."""
+        with self._changed:
+            self._number += 1
+            number = self._number
+        deadline, pause_s = time.monotonic() + timeout_s, _PAUSES_S[0]
+        while True:
+            self._send(self._word(number) + b" " * (_IMAGE_BYTES if images else 0))
+            with self._changed:
+                left_s = deadline - time.monotonic()
+                if self._changed.wait_for(lambda: min(self._answers.values(), default=number) >= number, pause_s):
+                    return True
+            if left_s < 0:
+                return False
+            pause_s = min(2 * pause_s, _PAUSES_S[1])
+
+    def linked(self, peer: str) -> None:
+        """A link to `peer` came up: learn what it holds."""
+        with self._changed:
+            self._answers.setdefault(peer, 0)
+            self._greet_again = True
+            if self._greeting:
+                return
+            self._greeting = True
+        threading.Thread(target=self._greet, name="greet", daemon=True).start()
+
+    def lost(self, peer: str) -> None:
+        """The link to `peer` ended, and with it what it held."""
+        with self._changed:
+            self._answers.pop(peer, None)
+            self._theirs.pop(peer, None)
+            self._tell()
+            self._changed.notify_all()
+
+    def heard(self, peer: str, payload: bytes) -> None:
+        """Take in what another session said, and answer a greeting; what cannot be understood is passed over."""
+        if peer == self._name or len(payload) > MAX_BYTES:
+            return
+        try:
+            word = msgspec.json.decode(payload, type=_Word)
+        except (msgspec.DecodeError, UnicodeDecodeError):
+            return
+        with self._changed:
+            # Where the link is gone, or not known yet, there is nothing to note: its coming up asks again.
+            if peer in self._answers:
+                self._theirs[peer] = frozenset(word.held)
+                if word.to == self._name:
+                    self._answers[peer] = max(self._answers[peer], word.number)
+                self._tell()
+                self._changed.notify_all()
+        if word.number > 0 and not word.to:
+            with suppress(TransportError):
+                self._send(self._word(word.number, peer))
+
+    def _greet(self) -> None:
+        while True:
+            with self._changed:
+                if not self._greet_again:
+                    self._greeting = False
+                    return
+                self._greet_again = False
+            with suppress(TransportError):
+                self.settle(SETTLE_S)
+
+    def _word(self, number: int = 0, to: str = "") -> bytes:
+        with self._changed:
+            return msgspec.json.encode(_Word(tuple(self._mine), number, to))
+
+    def _tell(self) -> None:
+        now = frozenset(self._mine).union(*self._theirs.values())
+        changes = [(token, True) for token in sorted(now - self._seen)]
+        changes += [(token, False) for token in sorted(self._seen - now)]
+        self._seen = set(now)
+        for token, alive in changes:
+            for pattern, watcher in list(self._watchers):
+                if key_matches(pattern, token):
+                    watcher(token, alive)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -45,6 +45,7 @@ class Collector:
     def __init__(self, bus: Bus, address: Address) -> None:
         self.stats: dict[str, Stats] = {}
         self.newest_state: State | None = None
+        self.observed: Counter[str] = Counter()
         self.sent = 0
         self._frames: OrderedDict[int, _Seen] = OrderedDict()
         self._headers: deque[tuple[Topic, Header]] = deque()
@@ -64,6 +65,7 @@ class Collector:
         while self._headers:
             self._note_header(*self._headers.popleft())
         for received in self._inbox.drain():
+            self.observed[received.key] += 1
             self._note(received.topic, received.message)
 
     def results(self) -> list[FrameResult]:
@@ -81,6 +83,7 @@ class Collector:
             self._headers.append((topic, decode_header(payload)))
         except CodecError:
             return  # the stages refuse and count it
+        self.observed[key] += 1
 
     def _note_header(self, topic: Topic, header: Header) -> None:
         seen = self._seen(header)

@@ -7,14 +7,14 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from bus.errors import RecordingError
-from bus.messages import State, Stats
+from bus.messages import State
 from bus.recording import partial_path
 from bus.replay import RecordingInfo, info
 from bus.signals import StopSignals
@@ -22,7 +22,7 @@ from bus.transport import ZenohBus
 from deploy.collector import Collector
 from deploy.errors import ProcessError
 from deploy.processes import CAMERA, HUB, OBSERVER, RECORDER, STAGES, TABLE, thread_environment, threads_of
-from deploy.results import FrameResult
+from deploy.results import RunResult
 from deploy.settings import Settings, to_json
 from deploy.supervision import Program, Supervisor
 
@@ -63,22 +63,10 @@ class Progress:
     restarts: int = 0
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """What a run has left; `interrupted`: by Ctrl-C or SIGTERM, before the source had ended."""
-
-    results: list[FrameResult]
-    stats: Mapping[str, Stats]
-    restarts: Mapping[str, int]
-    recording: RecordingInfo | None
-    interrupted: bool
-    start_s: float
-
-
 Report = Callable[[Progress], None]
 
 
-def run_pipeline(plan: Plan, report: Report = lambda progress: None) -> Outcome:
+def run_pipeline(plan: Plan, report: Report = lambda progress: None) -> RunResult:
     """Run the source to its end, or until Ctrl-C or SIGTERM, and end every process.
 
     Raises ProcessError where a process cannot start or does not stay up, TransportError for a bad or used address,
@@ -110,7 +98,7 @@ def programs(plan: Plan, folder: Path, hub: str) -> list[Program]:
             command += ["--record", str(plan.record.resolve()), "--wait-for", OBSERVER]
         elif name != HUB:
             command += ["--wait-for", *(everyone if name == CAMERA else listeners)]
-        programs.append(Program(name, command, thread_environment(threads), spec.stop_s))
+        programs.append(Program(name, command, thread_environment(threads), spec.stop_s, ends=name == CAMERA))
     return programs
 
 
@@ -130,7 +118,7 @@ class _Run:
         self._report = report
         self._limit = _RESTARTS_AT_START
 
-    def run(self) -> Outcome:
+    def run(self) -> RunResult:
         began = time.monotonic()
         bus = ZenohBus(self._hub)
         try:
@@ -143,9 +131,15 @@ class _Run:
             collector.close()
         finally:
             bus.close()
-        recording = _recording(self._plan.record, self._supervisor)
-        restarts = dict(self._supervisor.restarts)
-        return Outcome(collector.results(), collector.stats, restarts, recording, not finished, start_s)
+        return RunResult(
+            frames=collector.results(),
+            stats=collector.stats,
+            observed=collector.observed,
+            restarts=dict(self._supervisor.restarts),
+            recording=_recording(self._plan.record, self._supervisor),
+            interrupted=not finished,
+            start_s=start_s,
+        )
 
     def _start(self, bus: ZenohBus, collector: Collector) -> float:
         """Return when all processes are ready, or are to be stopped; returns when that was."""

@@ -95,6 +95,7 @@ def _rendering(launch: Launch) -> Handler:
 
 def _matching(launch: Launch) -> Handler:
     import torch
+
     from stages.matching.node import MatchingNode
 
     torch.set_num_threads(launch.threads)

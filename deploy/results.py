@@ -19,6 +19,7 @@ The keys of a summary, which programs may rely on:
   messages           {recorded, lost}: lost are those that the recorder should have got and has not written (without
                      a recorder: those that a stage should have got)
   restarts           name of a process -> how often it came back
+  start_s            seconds until all processes were ready
   processes          name -> busy_ms_p50, busy_ms_p90, cpu_s, rss_mb, failed, refused, gaps, skipped
 """
 
@@ -100,29 +101,42 @@ class FrameResult:
         return (self.answered_ns - self.sent_ns) / 1e6
 
 
-def summarise(
-    results: Sequence[FrameResult],
-    stats: Mapping[str, Stats],
-    restarts: Mapping[str, int],
-    recording: RecordingInfo | None,
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class RunResult:
+    """What a run has left: its frames, and what was heard of its processes.
+
+    `observed`: messages that the command itself has heard, by key; `interrupted`: by Ctrl-C or SIGTERM, before the
+    source had ended; `start_s`: until all processes were ready.
+    """
+
+    frames: Sequence[FrameResult]
+    stats: Mapping[str, Stats] = field(default_factory=dict)
+    observed: Mapping[str, int] = field(default_factory=dict)
+    restarts: Mapping[str, int] = field(default_factory=dict)
+    recording: RecordingInfo | None = None
+    interrupted: bool = False
+    start_s: float = 0.0
+
+
+def summarise(run: RunResult) -> dict[str, Any]:
     """The figures of a run, under the keys that this module's description lists."""
-    admitted = [result for result in results if result.outcome != "dropped"]
+    admitted = [result for result in run.frames if result.outcome != "dropped"]
     latencies = [result.latency_ms for result in admitted if result.latency_ms is not None]
     return {
         "frames": len(admitted),
         "frames_lost": sum(result.outcome == "lost" for result in admitted),
-        "frames_sent": sum(result.sent_ns is not None for result in results),
-        "dropped_at_the_door": sum(result.outcome == "dropped" for result in results),
+        "frames_sent": sum(result.sent_ns is not None for result in run.frames),
+        "dropped_at_the_door": sum(result.outcome == "dropped" for result in run.frames),
         "poses_ok": sum(result.cam_from_object is not None for result in admitted),
         **accuracy(admitted),
         "rate_hz": rate_hz(admitted),
         "latency_ms": {**_quantiles(latencies, (50, 90, 99)), "by_stage": _by_stage(admitted)},
         "passes": float(np.mean([result.passes for result in admitted])) if admitted else None,
         "states": dict(Counter(result.state for result in admitted if result.state is not None)),
-        "messages": _messages(recording, stats),
-        "restarts": dict(restarts),
-        "processes": {name: {key: getattr(s, key) for key in _STATS} for name, s in sorted(stats.items())},
+        "messages": _messages(run),
+        "restarts": dict(run.restarts),
+        "start_s": run.start_s,
+        "processes": {name: {key: getattr(s, key) for key in _STATS} for name, s in sorted(run.stats.items())},
     }
 
 
@@ -172,11 +186,18 @@ def to_csv(results: Iterable[FrameResult]) -> bytes:
     return text.getvalue().encode()
 
 
-def _messages(recording: RecordingInfo | None, stats: Mapping[str, Stats]) -> dict[str, int]:
-    if recording is None:
-        return {"recorded": 0, "lost": sum(s.gaps for s in stats.values())}
-    lost = sum(source.missing + source.received - source.written for source in recording.sources)
-    return {"recorded": recording.messages, "lost": lost}
+def _messages(run: RunResult) -> dict[str, int]:
+    """Missing are numbers that a sender's own count leaves out, or what only the command itself has heard."""
+    if run.recording is None:
+        return {"recorded": 0, "lost": sum(stats.gaps for stats in run.stats.values())}
+    missing: Counter[str] = Counter()
+    for source in run.recording.sources:
+        missing[source.key] += source.missing + source.received - source.written
+    recorded = Counter({topic.key: topic.messages for topic in run.recording.topics})
+    lost = sum(
+        max(missing[key], run.observed.get(key, 0) - recorded[key]) for key in missing.keys() | run.observed.keys()
+    )
+    return {"recorded": run.recording.messages, "lost": lost}
 
 
 def _by_stage(results: Sequence[FrameResult]) -> dict[str, dict[str, float | None]]:

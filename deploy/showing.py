@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
@@ -35,7 +35,7 @@ class Picture:
 
 def pictures(
     recording: Path,
-    results: list[FrameResult],
+    results: Sequence[FrameResult],
     renderer: RayRenderer,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> Iterator[Picture]:

@@ -97,9 +97,7 @@ class PoseFinder:
         pose = solved.cam_from_object
         refined = clock.time(
             "refinement",
-            lambda: refine(
-                self._renderer, image, camera, pose, pixels[solved.inliers], rng, self._settings.refinement
-            ),
+            lambda: refine(self._renderer, image, camera, pose, pixels[solved.inliers], rng, self._settings.refinement),
         )
         return _found(solved, refined, len(pixels), clock.ms)
 

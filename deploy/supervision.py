@@ -32,12 +32,16 @@ _RESTING = ("STOPPED", "EXITED", "FATAL")
 
 @dataclass(frozen=True)
 class Program:
-    """A process to keep up: its command line, what is added to its environment, how long it may take to stop."""
+    """A process to keep up: its command line, what is added to its environment, how long it may take to stop.
+
+    `ends`: exit code 0 means that it has done its work; without it, it is brought back after that too.
+    """
 
     name: str
     command: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)
     stop_s: float = 2.0
+    ends: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,14 +60,15 @@ class ProcessInfo:
     @property
     def given_up(self) -> bool:
         """It has ended, and will not come back."""
-        return self.state == "FATAL" or (self.state == "EXITED" and self.exit_code != 0)
+        return self.state == "FATAL" or (self.state == "EXITED" and self.exit_code == USER_ERROR)
 
 
 class Supervisor:
     """Runs programs while the context lasts; `folder` gets the configuration, a socket, and a log of each.
 
-    A program that ends with 0 or USER_ERROR stays down, any other end brings it back. All of them end with this
-    process, even if it is killed. Raises ProcessError where supervisord does not come up.
+    A program that ends with USER_ERROR stays down, and so does one that has done its work; any other end brings it
+    back. All of them end with this process, even if it is killed. Raises ProcessError where supervisord does not
+    come up.
     """
 
     def __init__(self, folder: Path, programs: Sequence[Program]) -> None:
@@ -94,15 +99,15 @@ class Supervisor:
         try:
             self._wait_for_answer(self._daemon)
         except BaseException:
-            self._end_daemon()
+            self._end_daemon(nothing_left=False)
             raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.stop([program.name for program in self._programs], timeout_s=1.0)
-        self._end_daemon()
+        ended = self.stop([program.name for program in self._programs], timeout_s=1.0)
+        self._end_daemon(nothing_left=ended)
 
     def poll(self) -> dict[str, ProcessInfo]:
         """The state of each process now; also counts who came back since the last time."""
@@ -191,10 +196,11 @@ class Supervisor:
         text = (self._folder / "supervisord.out").read_text(errors="replace").strip()
         return text.splitlines()[-1] if text else "it said nothing"
 
-    def _end_daemon(self) -> None:
+    def _end_daemon(self, nothing_left: bool) -> None:
         if self._daemon is None:
             return
-        self._daemon.send_signal(signal.SIGTERM)
+        # It takes a second to end by itself.
+        self._daemon.send_signal(signal.SIGKILL if nothing_left else signal.SIGTERM)
         try:
             self._daemon.wait(_END_S)
         except subprocess.TimeoutExpired:
@@ -235,7 +241,7 @@ def _program(folder: Path, program: Program) -> dict[str, object]:
         "command": shlex.join(program.command),
         "environment": environment,
         "autorestart": "unexpected",
-        "exitcodes": f"0,{USER_ERROR}",
+        "exitcodes": f"0,{USER_ERROR}" if program.ends else USER_ERROR,
         # Up as soon as it is started: a bad start is told by the exit code, and `check` counts the others.
         "startsecs": 0,
         "startretries": 3,

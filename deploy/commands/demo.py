@@ -14,8 +14,9 @@ from rich.progress import Progress
 
 from deploy.commands.run import INTERRUPTED, give_out
 from deploy.output import check_writable, progress_console, write_bytes, write_json
-from deploy.pipeline import Outcome, Plan, run_pipeline
+from deploy.pipeline import Plan, run_pipeline
 from deploy.report import live_line
+from deploy.results import RunResult
 from deploy.scene import demo_file
 from deploy.settings import Settings
 
@@ -27,7 +28,8 @@ class Options:
     Example: fieldpose demo --out out/demo
 
     It plays at the camera's own 30 frames a second; what the pipeline cannot keep up with is dropped at the door.
-    Writes into the folder: summary.json (keys as of `fieldpose run`), recording.mcap, and overlay.jpg and overlay.mp4: the field rendered at the poses found, over the camera's images.
+    Writes into the folder: summary.json (keys as of `fieldpose run`), recording.mcap, and overlay.jpg and
+    overlay.mp4: the field rendered at the poses found, over the camera's images.
     """
 
     out: Path = Path("out/demo")
@@ -60,14 +62,14 @@ class Options:
         print(f"written: {', '.join(str(path) for path in sorted(self.out.iterdir()))}")
         return 0
 
-    def _show(self, outcome: Outcome, field: Path, recording: Path) -> None:
+    def _show(self, outcome: RunResult, field: Path, recording: Path) -> None:
         from deploy.overlay import encoded
         from deploy.showing import pictures, write_video
         from stages.nerf.loading import load_renderer
 
         renderer = load_renderer(field, threads=0)
         with _bar("rendering the video") as report:
-            best = write_video(self.out / "overlay.mp4", pictures(recording, outcome.results, renderer, report))
+            best = write_video(self.out / "overlay.mp4", pictures(recording, outcome.frames, renderer, report))
         if best is not None:
             path = self.out / "overlay.jpg"
             write_bytes(path, encoded(best.pixels, path))

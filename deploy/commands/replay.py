@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, cast
@@ -56,8 +56,8 @@ class Options:
         with tempfile.TemporaryDirectory(prefix="fieldpose-") as folder, live_line("replay") as report:
             field = self.field or recorded_field(self.recording, recorded, Path(folder))
             outcome = run_pipeline(Plan(field, self._settings(), self.record), report)
-        summary = summarise(outcome.results, outcome.stats, outcome.restarts, outcome.recording)
-        comparison = compare(recorded_poses(self.recording), outcome.results)
+        summary = summarise(outcome)
+        comparison = compare(recorded_poses(self.recording), outcome.frames)
         print_summary(summary, f"replay of {self.recording}")
         _print(comparison, recorded)
         write_json(self.json, {**comparison, "replay": summary})
@@ -68,9 +68,7 @@ class Options:
         if self.config is not None:
             settings = changed(settings, read_file(self.config), str(self.config))
         # The frames are recorded as they were sent: shrunk, and with their camera.
-        camera = replace(
-            settings.camera, source=f"mcap:{self.recording}", size=None, camera_file=None, pace=self.pace
-        )
+        camera = replace(settings.camera, source=f"mcap:{self.recording}", size=None, camera_file=None, pace=self.pace)
         return replace(settings, camera=camera)
 
 
@@ -84,7 +82,7 @@ def recorded_poses(path: Path) -> dict[int, np.ndarray]:
     }
 
 
-def compare(recorded: Mapping[int, np.ndarray], results: list[FrameResult]) -> dict[str, Any]:
+def compare(recorded: Mapping[int, np.ndarray], results: Sequence[FrameResult]) -> dict[str, Any]:
     """How far poses of the same frame are apart, under the keys that `Options` documents."""
     replayed = {r.frame_id: r.cam_from_object for r in results if r.cam_from_object is not None}
     both = sorted(recorded.keys() & replayed.keys())

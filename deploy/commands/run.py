@@ -11,9 +11,9 @@ import tyro
 
 from deploy.errors import UsageError
 from deploy.output import check_writable, write_bytes, write_json
-from deploy.pipeline import Outcome, Plan, run_pipeline
+from deploy.pipeline import Plan, run_pipeline
 from deploy.report import live_line, print_summary
-from deploy.results import summarise, to_csv
+from deploy.results import RunResult, summarise, to_csv
 from deploy.settings import Settings
 from stages.camera.config import Pace
 from stages.camera.sources import is_video
@@ -97,13 +97,13 @@ class Options:
         return replace(s, camera=camera, tracking=tracking, matching=matching, refinement=refinement)
 
 
-def give_out(outcome: Outcome, title: str, json: Path | None, csv: Path | None = None) -> dict[str, object]:
+def give_out(outcome: RunResult, title: str, json: Path | None, csv: Path | None = None) -> dict[str, object]:
     """Print and write the figures of a run; returns them."""
-    summary = summarise(outcome.results, outcome.stats, outcome.restarts, outcome.recording)
+    summary = summarise(outcome)
     print_summary(summary, title)
     write_json(json, summary)
     if csv is not None:
-        write_bytes(csv, to_csv(outcome.results))
+        write_bytes(csv, to_csv(outcome.frames))
     return summary
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,7 +53,8 @@ class Options:
 
     def run(self) -> int:
         """Serve until SIGTERM, Ctrl-C, or the end of the source."""
-        if "SUPERVISOR_ENABLED" in os.environ:
+        supervised = "SUPERVISOR_ENABLED" in os.environ
+        if supervised:
             die_with_parent()
         log_to_stderr()
         make_handler = TABLE[self.name].handler
@@ -60,6 +62,10 @@ class Options:
             serve_hub(self.listen or self.connect)
         else:
             _serve(self, TABLE[self.name], make_handler)
+        if supervised:
+            # Everything is closed, and Python would take two seconds to take the numeric libraries apart.
+            sys.stderr.flush()
+            os._exit(0)
         return 0
 
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
+
+Backend = Literal["numba", "torch", "cuda"]
+"""Compiled kernels on the CPU; torch on the CPU (slow, plain); torch on a CUDA device."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +45,8 @@ class TrainingConfig:
     """Wall-clock time of the training loop."""
     steps: int | None = None
     """Stop after so many steps instead."""
+    backend: Backend = "numba"
+    """numba: compiled kernels on the CPU; cuda: torch on a CUDA device; torch: the same on the CPU, for comparison."""
     seed: int = 0
     samples_per_step: int = 1 << 14
     """Rays are added to a step until they carry about so many samples."""

@@ -15,10 +15,11 @@ import numpy as np
 from stages.nerf.config import FieldConfig, TrainingConfig
 from stages.nerf.datasets import Dataset, load_dataset
 from stages.nerf.field import Field
+from stages.nerf.loading import torch_device
 from stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
 from stages.nerf.raybank import View
 from stages.nerf.renderer import NumbaRenderer
-from stages.nerf.training import Progress, Trainer, evaluate
+from stages.nerf.training import Learner, Progress, Trainer, evaluate
 
 if TYPE_CHECKING:
     from stages.nerf.datasets.assemble import Holdout
@@ -113,7 +114,7 @@ def train_field(
     views = views_of(dataset)
     held_out = _held_out(path, size, holdout)
     metadata = metadata_of(dataset, views, config)
-    trainer = Trainer(views, metadata.space, config, training)
+    trainer = make_learner(views, metadata.space, config, training)
     monitor = _Monitor(trainer, metadata, held_out[: training.validation_views], report)
     start = time.monotonic()
     interrupted = False
@@ -122,7 +123,7 @@ def train_field(
     except KeyboardInterrupt:
         interrupted = True
     field = trainer.field(
-        replace_metadata(metadata, trained_seconds=time.monotonic() - start, trained_steps=trainer.optimiser.steps)
+        replace_metadata(metadata, trained_seconds=time.monotonic() - start, trained_steps=trainer.steps)
     )
     field.save(out)
     scores = evaluate(NumbaRenderer(field, training.threads), held_out) if held_out and not interrupted else []
@@ -130,6 +131,15 @@ def train_field(
         field.metadata = replace_metadata(field.metadata, psnr_db=float(np.mean(scores)))
         field.save(out)
     return TrainedField(field, scores, interrupted)
+
+
+def make_learner(views: list[View], space: Space, config: FieldConfig, training: TrainingConfig) -> Learner:
+    """Compiled kernels, or torch on the CPU or on CUDA. Raises ConfigError where there is no CUDA device."""
+    if training.backend == "numba":
+        return Trainer(views, space, config, training)
+    from stages.nerf.torch_training import TorchTrainer
+
+    return TorchTrainer(views, space, config, training, torch_device(training.backend))
 
 
 def replace_metadata(metadata: FieldMetadata, **changes: object) -> FieldMetadata:
@@ -150,7 +160,7 @@ class _Monitor:
 
     def __init__(
         self,
-        trainer: Trainer,
+        trainer: Learner,
         metadata: FieldMetadata,
         views: list[View],
         report: Callable[[TrainingReport], None],

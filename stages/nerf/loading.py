@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
+import torch
 
 from stages.errors import ConfigError
+from stages.nerf.config import Backend
 from stages.nerf.field import Field, load_field
 from stages.nerf.renderer import NumbaRenderer
 from stages.nerf.rendering_api import RayRenderer
 from stages.nerf.torch_renderer import TorchRenderer
-
-Backend = Literal["numba", "torch", "cuda"]
 
 
 def load_renderer(path: str | Path, threads: int = 1, backend: Backend = "numba") -> RayRenderer:
@@ -22,18 +21,15 @@ def load_renderer(path: str | Path, threads: int = 1, backend: Backend = "numba"
 
 
 def make_renderer(field: Field, threads: int = 1, backend: Backend = "numba") -> RayRenderer:
-    """A renderer of a field in memory, by compiled kernels, by torch on the CPU, or by torch on CUDA."""
-    if backend == "numba":
-        return NumbaRenderer(field, threads)
-    if backend == "torch":
-        return TorchRenderer(field)
-    if backend == "cuda":
-        import torch
+    """A renderer of a field in memory. Raises ConfigError where there is no CUDA device."""
+    return NumbaRenderer(field, threads) if backend == "numba" else TorchRenderer(field, torch_device(backend))
 
-        if not torch.cuda.is_available():
-            raise ConfigError("backend cuda: torch finds no CUDA device here; use numba")
-        return TorchRenderer(field, "cuda")
-    raise ConfigError(f"backend {backend!r}: expected numba, torch or cuda")
+
+def torch_device(backend: Backend) -> torch.device:
+    """The device of the torch backends. Raises ConfigError where there is no CUDA device."""
+    if backend == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("backend cuda: torch finds no CUDA device here; use numba")
+    return torch.device("cuda" if backend == "cuda" else "cpu")
 
 
 def warm_up(renderer: RayRenderer, jacobian: bool = False) -> None:

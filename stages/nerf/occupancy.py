@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from stages.geometry.cameras import Camera
-from stages.nerf.kernels.density import densities
-from stages.nerf.kernels.types import Net
 from stages.nerf.metadata import Space
-from stages.nerf.workers import Workers
 
 BLOCK = 8
 
@@ -65,7 +64,13 @@ class OccupancyEstimate:
         self.estimate = np.zeros(n**3, np.float32)
         self.occupied = allowed.copy()
 
-    def update(self, net: Net, workers: Workers, fraction: float, decay: float = 0.95, least: float = 0.01) -> None:
+    def update(
+        self,
+        densities: Callable[[np.ndarray], np.ndarray],
+        fraction: float,
+        decay: float = 0.95,
+        least: float = 0.01,
+    ) -> None:
         """Look at a random `fraction` of the cells and at as many of the occupied ones; then threshold anew.
 
         A cell is occupied where a step through it has an opacity of at least `least`, or more than the mean has.
@@ -77,10 +82,8 @@ class OccupancyEstimate:
             among = occupied if len(occupied) else self.candidates
             cells = np.concatenate([self._some(self.candidates, count), self._some(among, min(count, len(among)))])
         u = cell_positions(cells, self.n, self.rng.random((len(cells), 3), dtype=np.float32))
-        found = np.empty(len(cells), np.float32)
-        workers.each(len(cells), 4096, lambda scratch, a, b: densities(net, u, a, b, scratch.samples, found))
         self.estimate *= decay
-        np.maximum.at(self.estimate, cells, found)
+        np.maximum.at(self.estimate, cells, densities(u))
         opacity = self.estimate * self.space.step
         limit = min(least, float(opacity[self.candidates].mean()))
         self.occupied = ((opacity > limit) & self.allowed).reshape(self.n, self.n, self.n)

@@ -31,6 +31,13 @@ class Optimiser:
         }
         self.steps = 0
 
+    def compile(self) -> None:
+        """Have the kernel compiled, without a step."""
+        none = np.zeros(0, np.float32)
+        gradients = tuple(none for _ in self.gradients)
+        for sparse in (True, False):
+            adam_step(none, gradients, none, none, 0, 0, 0.0, BETA1, BETA2, EPSILON, sparse)
+
     def step(self, rate: float, workers: Workers) -> None:
         """Update the parameters in place and clear the gradients."""
         self.steps += 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -11,11 +12,13 @@ import numpy as np
 from stages.geometry.cameras import rays
 from stages.nerf.config import FieldConfig, TrainingConfig
 from stages.nerf.field import Field, domain_of, new_net
+from stages.nerf.kernels.density import densities
 from stages.nerf.kernels.train import train
+from stages.nerf.kernels.types import Net
 from stages.nerf.metadata import FieldMetadata, Space
 from stages.nerf.occupancy import OccupancyEstimate, seen_by_cameras
 from stages.nerf.optimiser import Optimiser
-from stages.nerf.raybank import RayBank, View
+from stages.nerf.raybank import Batch, RayBank, View
 from stages.nerf.renderer import NumbaRenderer
 from stages.nerf.workers import Workers
 
@@ -25,7 +28,8 @@ PER_RAY = 8
 STOP_BELOW = 1e-3
 CHUNK = 512
 OCCUPANCY_EVERY = 16
-SETTLED = 1024
+OFTEN, SETTLED = 256, 1024
+FIRST_RAYS, RAYS = 512, (256, 1 << 15)
 
 
 @dataclass(frozen=True)
@@ -40,68 +44,67 @@ class Progress:
     rays: int
 
 
-class Trainer:
-    """Holds the field that is being learnt; each step() improves it."""
+class Learner(ABC):
+    """A field that is being learnt; each step() improves it. What a batch does is the subclass's."""
 
     def __init__(self, views: list[View], space: Space, field: FieldConfig, config: TrainingConfig):
         self.config, self.space = config, space
         self._rng = np.random.default_rng(config.seed)
-        self.net = new_net(field, self._rng)
-        self.workers = Workers(field, config.threads, PACKET, ROWS, backward=True)
-        self.optimiser = Optimiser(self.net, self.workers.threads)
-        seen = seen_by_cameras(space, field.occupancy_resolution, [(v.camera, v.cam_from_object) for v in views])
-        self._occupancy = OccupancyEstimate(space, field.occupancy_resolution, seen, self._rng)
+        n = field.occupancy_resolution
+        seen = seen_by_cameras(space, n, [(v.camera, v.cam_from_object) for v in views])
+        self._occupancy = OccupancyEstimate(space, n, seen, self._rng)
         self._bank = RayBank(views, space)
-        self._domain = domain_of(space, self._occupancy.occupied)
-        self._rays = 512
-        self.samples = 0
+        self._rays = FIRST_RAYS
+        self.samples = self.steps = 0
 
-    @property
-    def occupied(self) -> np.ndarray:
-        """(n, n, n) bool, as a Field keeps it."""
-        return self._occupancy.occupied
+    @abstractmethod
+    def learn(self, batch: Batch, jitter: np.ndarray, rate: float) -> tuple[float, int]:
+        """Take one optimisation step; returns the batch's summed squared error and the samples evaluated."""
+
+    @abstractmethod
+    def densities(self, u: np.ndarray) -> np.ndarray:
+        """Densities (n,) float32 at points (n, 3) of the unit cube."""
+
+    @abstractmethod
+    def occupancy_changed(self, occupied: np.ndarray) -> None:
+        """Take over a new (n, n, n) bool occupancy."""
+
+    @abstractmethod
+    def net(self) -> Net:
+        """The parameters as they are now."""
+
+    def field(self, metadata: FieldMetadata) -> Field:
+        """The field as learnt so far; it may share memory with the learner."""
+        return Field(metadata, self.net(), self._occupancy.occupied)
 
     def step(self, fraction: float) -> float:
         """One batch at a `fraction` 0..1 of the schedule; returns its mean squared error."""
-        config = self.config
-        every = OCCUPANCY_EVERY if self.optimiser.steps < SETTLED else 4 * OCCUPANCY_EVERY
-        if self.optimiser.steps % every == 0:
-            self.update_occupancy()
-        rate = config.learning_rate * (config.final_learning_rate / config.learning_rate) ** fraction
-        n = self._rays
-        batch = self._bank.draw(self._rng, n)
-        jitter = self._rng.random(n, dtype=np.float32)
-        scale = np.float32(1 / n)
-        done = self.workers.split(
-            n,
-            lambda s, a, b: train(
-                self.net, self._domain, batch.origins, batch.directions, jitter, batch.background, batch.target,
-                a, b,
-                PER_RAY, STOP_BELOW, np.float32(config.huber_delta), np.float32(config.distortion), scale,
-                s.samples, s.rays, self.optimiser.gradients[s.index],
-            ),
-        )  # fmt: skip
-        self.optimiser.step(rate, self.workers)
-        evaluated = sum(d[1] for d in done)  # type: ignore[index]
+        if self.steps % (OCCUPANCY_EVERY if self.steps < SETTLED else 4 * OCCUPANCY_EVERY) == 0:
+            self.look_again()
+        rate = self.config.learning_rate * (self.config.final_learning_rate / self.config.learning_rate) ** fraction
+        batch = self._bank.draw(self._rng, self._rays)
+        squared, evaluated = self.learn(batch, self._rng.random(self._rays, dtype=np.float32), rate)
+        mse = squared / (3 * self._rays)
+        self.steps += 1
         self.samples += evaluated
-        self._adapt(evaluated / n)
-        return sum(d[0] for d in done) / (3 * n)  # type: ignore[index]
+        self._adapt(evaluated / self._rays)
+        return mse
+
+    def look_again(self) -> None:
+        """Estimate the occupancy anew, at a part of the grid; at all of it the first time."""
+        share = 1.0 if self.steps == 0 else (0.25 if self.steps < OFTEN else 1 / 8)
+        self._occupancy.update(self.densities, share)
+        self.occupancy_changed(self._occupancy.occupied)
 
     def _adapt(self, samples_per_ray: float) -> None:
         wanted = self.config.samples_per_step / max(samples_per_ray, 1.0)
         self._rays = int(np.clip(wanted, 0.8 * self._rays, 1.25 * self._rays + 1))
-        self._rays = int(np.clip(self._rays, 256, 1 << 15))
-
-    def update_occupancy(self) -> None:
-        """Look again at a part of the grid, at all of it the first time."""
-        steps = self.optimiser.steps
-        self._occupancy.update(self.net, self.workers, 1.0 if steps == 0 else (0.25 if steps < 256 else 1 / 8))
-        self._domain = domain_of(self.space, self._occupancy.occupied)
+        self._rays = int(np.clip(self._rays, *RAYS))
 
     def run(self, report: Callable[[Progress], None]) -> tuple[int, float]:
         """Step until the time (or the number of steps) of the configuration is over; returns steps and seconds.
 
-        KeyboardInterrupt passes through; the field is consistent after it.
+        KeyboardInterrupt passes through; the field is usable after it.
         """
         config = self.config
         start = time.monotonic()
@@ -116,9 +119,56 @@ class Trainer:
             error = mse if step == 1 else 0.95 * error + 0.05 * mse
             report(Progress(step, fraction, seconds, psnr(error), self.samples / max(seconds, 1e-9), self._rays))
 
-    def field(self, metadata: FieldMetadata) -> Field:
-        """The field as learnt so far (not a copy)."""
-        return Field(metadata, self.net, self.occupied)
+
+class Trainer(Learner):
+    """Learns with the compiled kernels."""
+
+    def __init__(self, views: list[View], space: Space, field: FieldConfig, config: TrainingConfig):
+        super().__init__(views, space, field, config)
+        self._net = new_net(field, self._rng)
+        self._workers = Workers(field, config.threads, PACKET, ROWS, backward=True)
+        self._optimiser = Optimiser(self._net, self._workers.threads)
+        self.occupancy_changed(self._occupancy.occupied)
+        self._compile()
+
+    def _compile(self) -> None:
+        """Meet the kernels once without work, so that compiling them takes no training time."""
+        nothing = np.zeros((0, 3), np.float32)
+        self.densities(nothing)
+        self._gradients(Batch(nothing, nothing, nothing, nothing), np.zeros(0, np.float32))
+        self._optimiser.compile()
+
+    def net(self) -> Net:
+        """See Learner."""
+        return self._net
+
+    def occupancy_changed(self, occupied: np.ndarray) -> None:
+        """See Learner."""
+        self._domain = domain_of(self.space, occupied)
+
+    def densities(self, u: np.ndarray) -> np.ndarray:
+        """See Learner."""
+        out = np.empty(len(u), np.float32)
+        self._workers.each(len(u), 4096, lambda s, a, b: densities(self._net, u, a, b, s.samples, out))
+        return out
+
+    def learn(self, batch: Batch, jitter: np.ndarray, rate: float) -> tuple[float, int]:
+        """See Learner."""
+        done = self._gradients(batch, jitter)
+        self._optimiser.step(rate, self._workers)
+        return sum(squared for squared, _ in done), sum(evaluated for _, evaluated in done)
+
+    def _gradients(self, batch: Batch, jitter: np.ndarray) -> list[tuple[float, int]]:
+        n = len(jitter)
+        delta, spread = np.float32(self.config.huber_delta), np.float32(self.config.distortion)
+        return self._workers.split(
+            n,
+            lambda s, a, b: train(
+                self._net, self._domain, batch.origins, batch.directions, jitter, batch.background, batch.target,
+                a, b, PER_RAY, STOP_BELOW, delta, spread, np.float32(1 / max(n, 1)),
+                s.samples, s.rays, self._optimiser.gradients[s.index],
+            ),
+        )  # type: ignore[return-value]  # fmt: skip
 
 
 def psnr(mean_squared_error: float) -> float:

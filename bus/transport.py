@@ -181,6 +181,8 @@ def _open(values: Mapping[str, Any], what: str) -> Any:
     common = {
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
+        # Opening a session waits this long for peers that the hub still names and that are gone.
+        "scouting/delay": 100,
         "transport/link/tx/lease": 2000,
         "transport/link/tx/queue/congestion_control/drop": _WAITS_US,
         "transport/shared_memory/enabled": True,

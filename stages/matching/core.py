@@ -48,7 +48,7 @@ class MatchingConfig:
     """longer side in pixels to which the frame is shrunk before its features are taken; 0 is the view's own"""
     patch_px: int = 9
     """side of the patches that place coarse matches between pixels; 0 leaves them where the matcher put them"""
-    erode_px: int = 1
+    erode_px: int = 0
     """how far inside the silhouette a pixel of the view must lie to be matched"""
     weights: Path | None = None
     """file or folder of network weights, in place of an installed package's"""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 import pytest
@@ -202,6 +204,14 @@ HOLDER = """
         outbox.publish(FRAME, frame(frame_id, width=120, height=90))
         time.sleep(0.02)
 """
+
+
+def pools_of_this_process() -> set[str]:
+    """The files of shared memory of at least 64 MB that this process has mapped."""
+    mapped = {line.split()[-1] for line in Path("/proc/self/maps").read_text().splitlines() if ".zenoh" in line}
+    return {path for path in mapped if Path(path).exists() and Path(path).stat().st_size >= 64 << 20}
+
+
 HUB = "import sys; from bus.transport import serve_hub; serve_hub(sys.argv[1])"
 
 
@@ -225,6 +235,8 @@ class TestProcesses:
         first.kill()
         first.wait()
         time.sleep(0.2)
+        inbox.drain()
+        assert inbox.get(5.0) is not None, "links between peers outlive the hub"
         second = spawn(HUB, endpoint)
         bus.wait_for_hub(10.0)
         late = Inbox(connect(endpoint), ADDRESS, [FRAME])
@@ -233,6 +245,19 @@ class TestProcesses:
         assert inbox.get(5.0) is not None
         second.terminate()
         assert second.wait(5.0) == 0
+
+    def test_images_pass_where_shared_memory_is_small(
+        self, hub: str, connect: Connect, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        usage = shutil.disk_usage("/")._replace(free=64 << 20)
+        monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+        sender, receiver = connect(hub), connect(hub)
+        before = pools_of_this_process()
+        inbox = Inbox(receiver, ADDRESS, [FRAME])
+        meet(sender, receiver)
+        Outbox(sender, ADDRESS, "camera").publish(FRAME, frame(0, width=480, height=360))
+        assert inbox.get(5.0) is not None
+        assert pools_of_this_process() <= before
 
     def test_two_hubs_on_one_port_is_one_clear_line(self, hub: str) -> None:
         with pytest.raises(TransportError, match=r"no hub at .* in use") as caught:

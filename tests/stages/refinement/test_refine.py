@@ -117,9 +117,7 @@ def test_keypoint_guided_sampling_beats_uniform_under_occlusion(scene: AnalyticS
     assert np.median(errors["keypoints"]) < 0.2 * np.median(errors["image"])
 
 
-def test_an_unknown_background_does_not_matter(
-    scene: AnalyticScene, image: np.ndarray, keypoints: np.ndarray
-) -> None:
+def test_an_unknown_background_does_not_matter(scene: AnalyticScene, image: np.ndarray, keypoints: np.ndarray) -> None:
     opacity = scene.render_rays(*rays(CAMERA, POSE)).opacity.reshape(160, 160, 1)
     clutter = np.random.default_rng(2).integers(0, 256, image.shape)
     elsewhere = (opacity * image + (1 - opacity) * clutter).astype(np.uint8)

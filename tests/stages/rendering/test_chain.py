@@ -84,9 +84,7 @@ def test_a_replayed_frame_gets_the_same_pose(make_nodes: Any, image: np.ndarray)
     assert np.array_equal(first.cam_from_object, second.cam_from_object)  # type: ignore[attr-defined]
 
 
-def test_refinement_switched_off_hands_the_estimate_on_without_the_frame(
-    make_nodes: Any, image: np.ndarray
-) -> None:
+def test_refinement_switched_off_hands_the_estimate_on_without_the_frame(make_nodes: Any, image: np.ndarray) -> None:
     nodes = make_nodes(RefinementConfig(steps=0))
     assert nodes[-1].inputs == (ESTIMATE,)
     said = run_chain(nodes, frame_message(image, LENS), guess_message(POSE_TRUE, LENS))

@@ -28,6 +28,8 @@ from stages.tracking.config import TrackingConfig
 
 T = TypeVar("T")
 
+VIDEO_VIEW_SIZE = 256
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -46,6 +48,13 @@ class Settings:
 def read_settings(path: Path | None) -> Settings:
     """The defaults, changed by a file where one is given. Raises ConfigError that names the file and the key."""
     return Settings() if path is None else changed(Settings(), read_file(path), str(path))
+
+
+def for_video(settings: Settings) -> Settings:
+    """The settings with what videos need in place of what was left open."""
+    if settings.rendering.size:
+        return settings
+    return dataclasses.replace(settings, rendering=dataclasses.replace(settings.rendering, size=VIDEO_VIEW_SIZE))
 
 
 def read_file(path: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from deploy.pipeline import Plan, run_pipeline
 from deploy.report import live_line
 from deploy.results import RunResult
 from deploy.scene import demo_file
-from deploy.settings import Settings
+from deploy.settings import Settings, for_video
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Options:
         recording = self.out / "recording.mcap"
         check_writable(recording, self.json)
         camera = replace(self.settings.camera, source=f"mcap:{sequence}")
-        plan = Plan(field, replace(self.settings, camera=camera), recording, logs=self.logs)
+        plan = Plan(field, for_video(replace(self.settings, camera=camera)), recording, logs=self.logs)
         with live_line("demo") as report:
             outcome = run_pipeline(plan, report)
         summary = give_out(outcome, "demo", self.out / "summary.json")

@@ -14,7 +14,7 @@ from deploy.output import check_writable, write_bytes, write_json
 from deploy.pipeline import Plan, run_pipeline
 from deploy.report import live_line, print_summary
 from deploy.results import RunResult, summarise, to_csv
-from deploy.settings import Settings
+from deploy.settings import Settings, for_video
 from stages.camera.config import Pace
 from stages.camera.sources import is_video
 from stages.nerf.field import load_field
@@ -94,7 +94,8 @@ class Options:
             tracking = replace(tracking, sequence="photos" if self.sequence == "auto" else self.sequence)
         refinement = s.refinement if self.refine else replace(s.refinement, steps=0)
         matching = _with(s.matching, matcher=self.matcher)
-        return replace(s, camera=camera, tracking=tracking, matching=matching, refinement=refinement)
+        settings = replace(s, camera=camera, tracking=tracking, matching=matching, refinement=refinement)
+        return for_video(settings) if tracking.sequence == "video" else settings
 
 
 def give_out(outcome: RunResult, title: str, json: Path | None, csv: Path | None = None) -> dict[str, object]:

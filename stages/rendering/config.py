@@ -9,8 +9,8 @@ from dataclasses import dataclass
 class RenderingConfig:
     """How large views are, and when an old one is near enough to be used again."""
 
-    size: int = 400
-    """longer side of a view in pixels; never more than the frame's"""
+    size: int = 0
+    """longer side of a view in pixels, never more than the frame's; 0: 400, and 256 for videos, where time is short"""
     min_visible: float = 0.002
     """a view whose pixels show the object to a smaller share is reported as a failure"""
     reuse_angle_deg: float = 5.0

@@ -15,6 +15,7 @@ from stages.rendering.config import RenderingConfig
 __all__ = ["RenderingConfig", "SourcedView", "ViewSource", "view_camera"]
 
 _PROBES = 256
+_DEFAULT_SIZE = 400
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,7 @@ class ViewSource:
 
     def view(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool = False) -> SourcedView:
         """The view of a frame's camera (undistorted, shrunk) at the guess or near it; nearer in a next pass."""
-        small = view_camera(camera, self._config.size)
+        small = view_camera(camera, self._config.size or _DEFAULT_SIZE)
         found = self._near(small, cam_from_object, self._config.next_pass_share if next_pass else 1.0)
         if found is not None:
             self._cache.move_to_end(found)

@@ -16,9 +16,9 @@ class MotionConfig:
     """The velocity is taken between the newest pose and the oldest one at most this much older."""
     horizon_ms: float = 1000.0
     """Poses further apart than this say nothing about the velocity, nor does a velocity reach further."""
-    damping_ms: float = 500.0
+    damping_ms: float = 200.0
     """The velocity is taken to decay with this time constant; inf keeps it."""
-    max_rotation_deg: float = 45.0
+    max_rotation_deg: float = 20.0
     """Largest turn that is predicted."""
     max_translation: float = 0.5
     """Largest shift that is predicted, x scale."""
@@ -57,7 +57,7 @@ class TrackingConfig:
     """Frames in flight at once."""
     passes: int = 3
     """Most passes over a frame whose guess may be far off: the pose found becomes the next guess."""
-    retries: int = 0
+    retries: int = 1
     """How many other guesses to try on the same frame when one has led nowhere."""
     seed: int = 0
     """Of the disturbed guesses."""
@@ -73,9 +73,9 @@ class TrackingConfig:
     """A pose this near its guess needs no further pass."""
     settled: float = 0.005
     """The same in translation, x scale."""
-    far_deg: float = 12.0
+    far_deg: float = 20.0
     """A pose this far from its guess is not believed before another pass has found it again."""
-    far: float = 0.12
+    far: float = 0.25
     """The same in translation, x scale."""
     jump_deg: float = 8.0
     """A pose further than this from the motion model's is a jump, and waits for a second frame to confirm it."""
@@ -85,7 +85,7 @@ class TrackingConfig:
     """How the allowance grows with the time since the last pose."""
     jump_per_s: float = 1.0
     """The same in translation, x scale."""
-    lost_after: int = 5
+    lost_after: int = 3
     """Frames in a row without a usable pose until tracking is lost."""
     weak_after: int = 20
     """Frames in a row with usable but never good poses until it is, once limited."""

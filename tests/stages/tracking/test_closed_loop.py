@@ -82,7 +82,6 @@ def test_finds_itself_among_the_training_views(start: np.ndarray | None) -> None
     world = World(following(start), hand_held).run(10)
     reasons = world.first_reasons()
     assert reasons[0] == (GuessReason.RELOCALISATION if start is None else GuessReason.PRIOR)
-    assert GuessReason.RELOCALISATION in reasons
     assert share(world.states(7), TRACKING) == 1
     assert max(world.worst_error(world.reports)) < 2.0
 

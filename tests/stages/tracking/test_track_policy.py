@@ -58,7 +58,7 @@ def tracking(**config: object) -> Camera:
 def test_the_guess_runs_ahead_with_the_motion() -> None:
     guess = tracking().guess()
     assert guess.reason is GuessReason.MOTION
-    assert rotation_error_deg(guess.cam_from_object, on_sphere(10, 30)) < 0.1
+    assert rotation_error_deg(guess.cam_from_object, on_sphere(10, 30)) < 0.2
     assert rotation_error_deg(guess.cam_from_object, on_sphere(9, 30)) > 0.7
 
 

@@ -1,0 +1,196 @@
+"""What `fieldpose doctor` looks at: each check says what it found, and how to mend what is not well."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import socket
+import statistics
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Literal
+
+import psutil
+
+from bus.errors import FieldposeError
+from deploy.pipeline import free_port
+from stages.errors import StageError
+
+_PACKAGES = ("torch", "kornia", "numba", "numpy", "opencv-python-headless", "eclipse-zenoh", "mcap", "supervisor")
+_SHARED_MEMORY = Path("/dev/shm")
+_SHARED_MEMORY_MB = 256
+_NEEDED_GB = 3.0
+_DEFAULT_PORT = 7447
+_ECHOES = 20
+_ECHO_BYTES = 1 << 20
+_SLOW_ECHO_MS = 20.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """`failed` keeps fieldpose from working, `warning` makes it work less well, `note` takes something optional."""
+
+    what: str
+    status: Literal["ok", "note", "warning", "failed"]
+    detail: str
+    mend: str = ""
+
+
+Check = Callable[[], Iterator[Finding]]
+
+
+def machine() -> Iterator[Finding]:
+    """Processor and memory."""
+    cores = len(os.sched_getaffinity(0))
+    text = f"{platform.system()} {platform.machine()}, {cores} cores"
+    yield Finding(
+        "machine", "ok" if cores > 1 else "warning", text, "" if cores > 1 else "two cores or more are faster"
+    )
+    memory = psutil.virtual_memory()
+    enough = memory.available / 2**30 >= _NEEDED_GB
+    text = f"{memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GB free"
+    yield Finding("memory", "ok" if enough else "warning", text, "" if enough else f"{_NEEDED_GB:g} GB are needed")
+    if not _SHARED_MEMORY.is_dir():
+        yield Finding("shared memory", "warning", "none", "images will go over TCP, three times slower")
+        return
+    free_mb = shutil.disk_usage(_SHARED_MEMORY).free / 2**20
+    enough = free_mb >= _SHARED_MEMORY_MB
+    mend = "" if enough else f"images will go over TCP; give {_SHARED_MEMORY_MB} MB (docker: --shm-size)"
+    yield Finding("shared memory", "ok" if enough else "warning", f"{free_mb:.0f} MB free in {_SHARED_MEMORY}", mend)
+
+
+def packages() -> Iterator[Finding]:
+    """Python and the packages that matter most."""
+    yield Finding("python", "ok", platform.python_version())
+    for name in _PACKAGES:
+        try:
+            yield Finding(name, "ok", metadata.version(name))
+        except metadata.PackageNotFoundError:
+            yield Finding(name, "failed", "not installed", "`make install`")
+
+
+def bus() -> Iterator[Finding]:
+    """A hub, two processes' worth of sessions, and a megabyte there and back."""
+    try:
+        median_ms = statistics.median(_round_trips_ms())
+        slow = median_ms > _SLOW_ECHO_MS
+        yield Finding("bus", "warning" if slow else "ok", f"1 MB there and back through the hub: {median_ms:.1f} ms")
+    except FieldposeError as error:
+        yield Finding("bus", "failed", str(error), "is the loopback interface up, or a firewall in the way?")
+    with socket.socket() as probe:
+        taken = probe.connect_ex(("127.0.0.1", _DEFAULT_PORT)) == 0
+    detail = "somebody listens there, a hub perhaps" if taken else "free"
+    yield Finding(f"port {_DEFAULT_PORT}", "note" if taken else "ok", detail)
+
+
+def weights() -> Iterator[Finding]:
+    """Whether each matcher can be had, and how long it takes to load."""
+    from stages.matching.core import MATCHERS, MatchingConfig, build_matcher
+
+    default = MatchingConfig().matcher
+    for name in MATCHERS:
+        began = time.perf_counter()
+        try:
+            build_matcher(MatchingConfig(matcher=name))
+        except StageError as error:
+            yield Finding(f"matcher {name}", "failed" if name == default else "note", str(error))
+        else:
+            yield Finding(f"matcher {name}", "ok", f"loaded in {time.perf_counter() - began:.1f} s")
+
+
+def kernels() -> Iterator[Finding]:
+    """Whether the field's kernels are compiled already."""
+    from numba import config
+
+    import stages.nerf.kernels  # noqa: F401 (says where the cache is)
+
+    folder = Path(config.CACHE_DIR)
+    compiled = len(list(folder.rglob("*.nbi")))
+    detail = f"{compiled} compiled, in {folder}" if compiled else "not compiled yet"
+    mend = "" if compiled else "the first start takes half a minute longer"
+    yield Finding("kernels", "ok" if compiled else "note", detail, mend)
+
+
+def demo_scene() -> Iterator[Finding]:
+    """Whether the embedded scene is there."""
+    from deploy.scene import demo_file
+
+    for name in ("field.safetensors", "sequence.mcap"):
+        try:
+            yield Finding(f"demo {name}", "ok", str(demo_file(name)))
+        except FieldposeError as error:
+            yield Finding(f"demo {name}", "note", "not there", str(error))
+
+
+def field(path: Path) -> Iterator[Finding]:
+    """Whether a field can be loaded."""
+    from stages.nerf.field import load_field
+
+    try:
+        about = load_field(path).metadata
+    except StageError as error:
+        yield Finding("field", "failed", str(error))
+        return
+    quality = "not measured" if about.psnr_db is None else f"{about.psnr_db:.1f} dB"
+    yield Finding("field", "ok", f"{path}: {about.dataset_kind}, {len(about.cameras)} training views, {quality}")
+
+
+def dataset(path: Path) -> Iterator[Finding]:
+    """Whether a dataset can be read, every image of it."""
+    from stages.nerf.datasets import load_dataset
+
+    try:
+        found = load_dataset(path, "all")
+        for index in range(len(found)):
+            found.load_image(index)
+    except StageError as error:
+        yield Finding("dataset", "failed", str(error))
+        return
+    test = sum(record.split == "test" for record in found.images)
+    yield Finding(
+        "dataset", "ok", f"{path}: {found.kind}, {found.scene}, {len(found) - test} train, {test} test images"
+    )
+    yield from (Finding("dataset", "note", note) for note in found.notes)
+
+
+def _round_trips_ms() -> list[float]:
+    from bus.topics import VIEW
+    from bus.transport import ZenohBus, serve_hub
+
+    hub, stop = f"tcp/127.0.0.1:{free_port()}", threading.Event()
+    serving = threading.Thread(target=serve_hub, args=(hub, None, stop), daemon=True)
+    serving.start()
+    here, there = ZenohBus(hub), ZenohBus(hub)
+    try:
+        here.wait_for_hub(5.0)
+        there.wait_for_hub(5.0)
+        came = threading.Event()
+        there.subscribe(
+            "fieldpose/doctor/there", lambda key, data, at: there.put("fieldpose/doctor/back", data, VIEW), 8
+        )
+        here.subscribe("fieldpose/doctor/back", lambda key, data, at: came.set(), 8)
+        return [
+            _round_trip_ms(lambda: here.put("fieldpose/doctor/there", bytes(_ECHO_BYTES), VIEW), came)
+            for _ in range(_ECHOES)
+        ]
+    finally:
+        here.close()
+        there.close()
+        stop.set()
+        serving.join()
+
+
+def _round_trip_ms(send: Callable[[], None], came: threading.Event) -> float:
+    """Sends until an answer comes, as sessions take a moment to find each other."""
+    for _ in range(50):
+        came.clear()
+        began = time.perf_counter()
+        send()
+        if came.wait(0.2):
+            return (time.perf_counter() - began) * 1e3
+    raise FieldposeError("nothing comes back over the bus")

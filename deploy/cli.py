@@ -106,7 +106,7 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
 
 
 def _value_of(flag: str, arguments: list[str]) -> str | None:
-    for argument, following in zip(arguments, [*arguments[1:], None], strict=True):
+    for argument, following in zip(arguments, [*arguments[1:], None], strict=False):
         if argument == flag:
             return following
         if argument.startswith(flag + "="):

@@ -21,8 +21,8 @@ class LiftingNode(JoinedHandler):
     """Lifts the matches of each view; the guess tells the frame's camera. Raises FieldFileError at start."""
 
     name = "lifting"
-    inputs = (MATCHES, VIEW, GUESS)
-    outputs = (CORRESPONDENCES,)
+    inputs: tuple[Topic, ...] = (MATCHES, VIEW, GUESS)
+    outputs: tuple[Topic, ...] = (CORRESPONDENCES,)
 
     def __init__(self, field: Path, config: LiftingConfig, threads: int = 1) -> None:
         super().__init__()

@@ -18,8 +18,8 @@ class MatchingNode(JoinedHandler):
     """Matches each view with its frame. Raises ConfigError and WeightsError at start."""
 
     name = "matching"
-    inputs = (VIEW, FRAME)
-    outputs = (MATCHES,)
+    inputs: tuple[Topic, ...] = (VIEW, FRAME)
+    outputs: tuple[Topic, ...] = (MATCHES,)
 
     def __init__(self, config: MatchingConfig) -> None:
         super().__init__()

@@ -19,8 +19,8 @@ class PnpNode(JoinedHandler):
     """Solves for the pose of each frame from its kept correspondences."""
 
     name = "pnp"
-    inputs = (CORRESPONDENCES,)
-    outputs = (ESTIMATE,)
+    inputs: tuple[Topic, ...] = (CORRESPONDENCES,)
+    outputs: tuple[Topic, ...] = (ESTIMATE,)
 
     def __init__(self, config: PnpConfig) -> None:
         super().__init__()

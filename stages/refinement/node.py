@@ -20,7 +20,7 @@ class RefinementNode(JoinedHandler):
     """Refines each estimate, and hands it on as it is where it cannot. Raises FieldFileError at start."""
 
     name = "refinement"
-    outputs = (POSE,)
+    outputs: tuple[Topic, ...] = (POSE,)
 
     def __init__(self, field: Path, config: RefinementConfig, threads: int = 1) -> None:
         self.inputs = (ESTIMATE, FRAME) if config.steps > 0 else (ESTIMATE,)

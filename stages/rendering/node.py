@@ -22,8 +22,8 @@ class RenderingNode(JoinedHandler):
     """Answers each guess with the view there. Raises FieldFileError at start."""
 
     name = "rendering"
-    inputs = (GUESS,)
-    outputs = (VIEW,)
+    inputs: tuple[Topic, ...] = (GUESS,)
+    outputs: tuple[Topic, ...] = (VIEW,)
 
     def __init__(self, field: Path, config: RenderingConfig, threads: int = 1) -> None:
         super().__init__()

@@ -54,6 +54,17 @@ def seen_by_cameras(space: Space, n: int, cameras: list[tuple[Camera, np.ndarray
     return (count >= least).reshape(m, m, m).repeat(2, 0).repeat(2, 1).repeat(2, 2)
 
 
+def near_cameras(space: Space, n: int, cameras: list[tuple[np.ndarray, float]]) -> np.ndarray:
+    """(n, n, n) bool: cells whose centre is nearer to one of the camera centres (3,) than its distance."""
+    m = n // 2
+    points = from_cube(space, cell_positions(np.arange(m**3), m, np.full((1, 3), 0.5)))
+    near = np.zeros(m**3, bool)
+    for centre, distance in cameras:
+        with np.errstate(invalid="ignore"):
+            near |= ((points - centre) ** 2).sum(axis=1) < distance**2
+    return near.reshape(m, m, m).repeat(2, 0).repeat(2, 1).repeat(2, 2)
+
+
 class OccupancyEstimate:
     """A running maximum of the density in every cell (Instant-NGP's update), for training."""
 

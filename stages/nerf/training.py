@@ -9,14 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stages.geometry import camera_centre
 from stages.geometry.cameras import rays
 from stages.nerf.config import FieldConfig, TrainingConfig
+from stages.nerf.datasets.bounds import nearest_point_to_axes
 from stages.nerf.field import Field, domain_of, new_net
 from stages.nerf.kernels.density import densities
 from stages.nerf.kernels.train import train
 from stages.nerf.kernels.types import Net
 from stages.nerf.metadata import FieldMetadata, Space
-from stages.nerf.occupancy import OccupancyEstimate, seen_by_cameras
+from stages.nerf.occupancy import OccupancyEstimate, near_cameras, seen_by_cameras
 from stages.nerf.optimiser import Optimiser
 from stages.nerf.raybank import Batch, RayBank, View
 from stages.nerf.renderer import NumbaRenderer
@@ -29,6 +31,7 @@ STOP_BELOW = 1e-3
 CHUNK = 512
 OCCUPANCY_EVERY = 16
 OFTEN, SETTLED = 256, 1024
+FREE_SHARE = 0.2
 FIRST_RAYS, RAYS = 512, (256, 1 << 15)
 
 
@@ -52,7 +55,7 @@ class Learner(ABC):
         self._rng = np.random.default_rng(config.seed)
         n = field.occupancy_resolution
         seen = seen_by_cameras(space, n, [(v.camera, v.cam_from_object) for v in views])
-        self._occupancy = OccupancyEstimate(space, n, seen, self._rng)
+        self._occupancy = OccupancyEstimate(space, n, seen & ~_before_lenses(views, space, n), self._rng)
         self._bank = RayBank(views, space)
         self._rays = FIRST_RAYS
         self.samples = self.steps = 0
@@ -169,6 +172,14 @@ class Trainer(Learner):
                 s.samples, s.rays, self._optimiser.gradients[s.index],
             ),
         )  # type: ignore[return-value]  # fmt: skip
+
+
+def _before_lenses(views: list[View], space: Space, n: int) -> np.ndarray:
+    """Cells (n, n, n) just in front of a camera, where haze would explain its image and hide the scene from others."""
+    poses = [v.cam_from_object for v in views]
+    focus = nearest_point_to_axes(poses)
+    centres = [camera_centre(pose) for pose in poses]
+    return near_cameras(space, n, [(c, FREE_SHARE * float(np.linalg.norm(c - focus))) for c in centres])
 
 
 def psnr(mean_squared_error: float) -> float:

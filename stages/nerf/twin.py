@@ -151,8 +151,7 @@ class TwinField(nn.Module):
         weights = before - after
         opacity = weights.sum(1)
         features = (weights[..., None] * out[..., 1:]).sum(1)
-        depth = (weights * samples.t).sum(1) / opacity.clamp(min=1e-4)
-        depth = torch.where(opacity > 1e-4, depth, torch.zeros_like(depth))
+        depth = surface(samples, before, after, weights, opacity)
         rest = torch.relu(torch.cat([features, harmonics(directions)], 1) @ self.c1)
         view_part = torch.relu(rest @ self.c2) @ self.c3
         o = opacity[:, None]
@@ -166,6 +165,19 @@ class TwinField(nn.Module):
 def twin_of(field: Field, device: torch.device | str = "cpu") -> TwinField:
     """The twin of a field, with copies of its arrays."""
     return TwinField(field.net, field.metadata.space, field.occupied, device)
+
+
+def surface(samples: TwinSamples, before: Tensor, after: Tensor, weights: Tensor, opacity: Tensor) -> Tensor:
+    """Where half of the light is stopped (n,), the mean of what stops less, 0 where nothing does."""
+    mean = (weights * samples.t).sum(1) / opacity.clamp(min=1e-4)
+    mean = torch.where(opacity > 1e-4, mean, torch.zeros_like(mean))
+    if samples.t.shape[1] == 0:
+        return mean
+    half = (before >= 0.5) & (after < 0.5) & samples.valid
+    at = half.int().argmax(1, keepdim=True)
+    t, dt, b, a = (v.gather(1, at)[:, 0] for v in (samples.t, samples.dt, before, after))
+    share = torch.log(b / 0.5) / torch.log(b / a.clamp(min=1e-9))
+    return torch.where(half.any(1), t + dt * (share - 0.5), mean)
 
 
 def harmonics(d: Tensor) -> Tensor:

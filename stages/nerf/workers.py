@@ -58,6 +58,7 @@ def new_rays(config: FieldConfig, count: int) -> Rays:
         feats=array(count, width),
         opacity=array(count),
         depth=array(count),
+        median=array(count),
         h1=array(count, hidden),
         h2=array(count, hidden),
         rgb=array(count, 3),

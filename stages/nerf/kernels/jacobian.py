@@ -13,7 +13,7 @@ from stages.nerf.kernels.backward import (
     shade_backward,
 )
 from stages.nerf.kernels.encoding import position_gradient
-from stages.nerf.kernels.packet import forward, shade
+from stages.nerf.kernels.packet import forward, shade, surface
 from stages.nerf.kernels.space import cube_gradient
 from stages.nerf.kernels.types import FASTMATH, SH_SIZE, Domain, Net, Rays, Samples
 
@@ -104,9 +104,8 @@ def render_jacobian(
         for r in range(count):
             for c in range(3):
                 rgb[start + r, c] = shade(rays, r, c, background[c])
-            o = rays.opacity[r]
-            opacity[start + r] = o
-            depth[start + r] = rays.depth[r] / o if o > np.float32(1e-4) else np.float32(0)
+            opacity[start + r] = rays.opacity[r]
+            depth[start + r] = surface(rays, r)
         for k in range(channel_weights.shape[0]):
             for r in range(count):
                 for c in range(3):

@@ -26,6 +26,7 @@ def begin(
         rays.alive[r] = far > near
         rays.opacity[r] = 0
         rays.depth[r] = 0
+        rays.median[r] = 0
         rays.feats[r, :] = 0
 
 

@@ -12,6 +12,8 @@ from stages.nerf.kernels.march import advance, begin
 from stages.nerf.kernels.types import FASTMATH, SH_SIZE, Domain, Net, Rays, Samples
 
 MAX_EXPONENT = np.float32(11.0)
+HALF = np.float32(0.5)
+SMALLEST = np.float32(1e-9)
 
 
 @njit(nogil=True, fastmath=FASTMATH)
@@ -52,6 +54,9 @@ def composite(samples: Samples, first: int, last: int, stop_below: float, rays: 
         samples.weight[s], samples.trans[s], rays.trans[r] = weight, after, after
         rays.opacity[r] += weight
         rays.depth[r] += weight * samples.t[s]
+        if before >= HALF and after < HALF:
+            share = math.log(before / HALF) / math.log(before / max(after, SMALLEST))
+            rays.median[r] = samples.t[s] + samples.dt[s] * (share - HALF)
         for f in range(features):
             rays.feats[r, f] += weight * samples.out[s, 1 + f]
         if after < stop_below:
@@ -93,6 +98,14 @@ def shade(rays: Rays, r: int, channel: int, background: float) -> float:
     """Colour of a ray: 0.5 and the features' own colour, the view-dependent part, the background behind."""
     o = rays.opacity[r]
     return rays.feats[r, channel] + o * (rays.rgb[r, channel] + np.float32(0.5)) + (np.float32(1) - o) * background
+
+
+@njit(inline="always")
+def surface(rays: Rays, r: int) -> float:
+    """Where the surface is: the median, which haze in front does not shift, or the mean of what is half open."""
+    if rays.median[r] > 0:
+        return rays.median[r]
+    return rays.depth[r] / rays.opacity[r] if rays.opacity[r] > np.float32(1e-4) else np.float32(0)
 
 
 @njit(nogil=True, fastmath=FASTMATH)

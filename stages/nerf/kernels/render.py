@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.nerf.kernels.packet import forward, shade
+from stages.nerf.kernels.packet import forward, shade, surface
 from stages.nerf.kernels.types import FASTMATH, Domain, Net, Rays, Samples
 
 
@@ -39,7 +39,6 @@ def render(
         for r in range(count):
             for c in range(3):
                 rgb[start + r, c] = shade(rays, r, c, background[c])
-            o = rays.opacity[r]
-            opacity[start + r] = o
-            depth[start + r] = rays.depth[r] / o if o > np.float32(1e-4) else np.float32(0)
+            opacity[start + r] = rays.opacity[r]
+            depth[start + r] = surface(rays, r)
     return total

@@ -68,7 +68,8 @@ class Rays(NamedTuple):
     alive: np.ndarray
     feats: np.ndarray  # (r, features + SH_SIZE) composited features, then the direction's harmonics
     opacity: np.ndarray
-    depth: np.ndarray
+    depth: np.ndarray  # weighted mean of the samples' distances, not divided by the opacity
+    median: np.ndarray  # distance at which half of the light is stopped, 0 where it is not
     h1: np.ndarray
     h2: np.ndarray
     rgb: np.ndarray  # (r, 3) view-dependent part

@@ -12,9 +12,10 @@ from deploy.errors import OutputError
 from stages.geometry import Camera
 from stages.nerf.rendering_api import RenderedView
 
-EDGE_RGB = (0, 255, 170)
+EDGE_RGB = (255, 70, 220)
 _RENDER_SHARE = 0.45
-_EDGE_THRESHOLDS = (60, 140)
+_EDGE_THRESHOLDS = (80, 180)
+_LINE_PX = 20
 
 
 def overlaid(image: np.ndarray, view: RenderedView) -> np.ndarray:
@@ -38,10 +39,12 @@ def _outline(opacity: np.ndarray) -> np.ndarray:
 def captioned(picture: np.ndarray, lines: list[str]) -> np.ndarray:
     """A copy of a picture (h, w, 3) uint8 with lines of text at its top left."""
     picture = picture.copy()
+    font, scale = cv2.FONT_HERSHEY_SIMPLEX, 0.45
     for row, line in enumerate(lines):
-        for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-            place = (8, 18 + 17 * row)
-            cv2.putText(picture, line, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, thickness, cv2.LINE_AA)
+        width = cv2.getTextSize(line, font, scale, 1)[0][0]
+        bottom = (row + 1) * _LINE_PX
+        cv2.rectangle(picture, (0, bottom - _LINE_PX), (width + 12, bottom), (0, 0, 0), cv2.FILLED)
+        cv2.putText(picture, line, (6, bottom - 6), font, scale, (255, 255, 255), 1, cv2.LINE_AA)
     return picture
 
 

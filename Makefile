@@ -9,14 +9,13 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 DEV := import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["dependency-groups"]["dev"], sep="\n")
 
-.PHONY: help install demo test lint bench clean
+.PHONY: help install demo test lint clean
 
 help:
 	@echo "make install   a virtual environment in $(VENV) with everything pinned"
 	@echo "make demo      the embedded scene through the whole pipeline; writes out/demo"
 	@echo "make test      lint, types, architecture, tests"
 	@echo "make lint      only the first three"
-	@echo "make bench     the benchmarks"
 
 install: $(INSTALLED)
 
@@ -39,9 +38,6 @@ lint: $(INSTALLED)
 
 test: lint
 	$(BIN)/pytest
-
-bench: $(INSTALLED)
-	$(BIN)/pytest tests/benchmark
 
 clean:
 	rm -rf out build *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache .import_linter_cache

@@ -30,7 +30,7 @@ COMMANDS = {
     "doctor": "check this machine, the bus, the weights, a dataset",
 }
 _BAD_INPUT, _INTERRUPTED = 2, 130
-_BOX_EDGES = " \t│"
+_FRAME = " \t│╭╮╰╯"
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -115,11 +115,15 @@ def _value_of(flag: str, arguments: list[str]) -> str | None:
 
 
 def _one_line(framed: str) -> str:
-    """The first part of tyro's framed message, and the first option that it suggests."""
-    lines = [line.strip(_BOX_EDGES) for line in framed.splitlines() if not line.startswith(("╭", "╰"))]
-    parts = re.split(r"\n─+\n", "\n".join(lines))
-    suggested = next((re.search(r"--[\w.-]+", part) for part in parts[1:] if part.startswith("Perhaps")), None)
-    text = " ".join(parts[0].split())
+    """The first part of tyro's framed message, and the first option that it suggests.
+
+    The frame has a title, and lines between its parts; it is drawn with dashes where the terminal has nothing else.
+    """
+    lines = [line.strip(_FRAME) for line in framed.splitlines()][1:]
+    parts = [part.strip() for part in re.split(r"(?m)^[─-]+$", "\n".join(lines))]
+    first, *others = [part for part in parts if part] or ["cannot be understood"]
+    suggested = next((re.search(r"--[\w.-]+", part) for part in others if part.startswith("Perhaps")), None)
+    text = " ".join(first.split())
     return f"{text} (did you mean {suggested.group()}?)" if suggested else text
 
 

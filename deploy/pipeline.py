@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import re
 import shutil
 import socket
 import sys
@@ -13,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from bus.errors import RecordingError
+from bus.errors import RecordingError, TransportError
 from bus.messages import State
 from bus.recording import partial_path
 from bus.replay import RecordingInfo, info
@@ -26,6 +28,7 @@ from deploy.results import RunResult
 from deploy.settings import Settings, to_json
 from deploy.supervision import Program, Supervisor
 
+_TCP = re.compile(r"(?:tcp|tls|ws|wss)/(?P<host>[\w.-]+):(?P<port>\d+)")
 _START_S = 300.0
 _RESTARTS_AT_START, _RESTARTS = 2, 10
 _POLL_S = 0.1
@@ -73,6 +76,7 @@ def run_pipeline(plan: Plan, report: Report = lambda progress: None) -> RunResul
     RecordingError for a recording that is in the way or could not be finished.
     """
     _check_recording(plan.record)
+    _check_free(plan.listen)
     with StopSignals() as signals, _folder(plan.logs) as folder:
         hub = plan.listen or f"tcp/127.0.0.1:{free_port()}"
         with Supervisor(folder, programs(plan, folder, hub)) as supervisor:
@@ -107,6 +111,21 @@ def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
+
+
+def _check_free(listen: str | None) -> None:
+    """Raise TransportError where another program listens already; what is no address the hub will tell."""
+    found = None if listen is None else _TCP.fullmatch(listen)
+    if found is None:
+        return
+    with socket.socket() as probe:
+        # As the hub does; else a port would count as used for a minute after the last one.
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((found["host"], int(found["port"])))
+        except (OSError, OverflowError) as error:
+            reason = "the port is in use" if getattr(error, "errno", 0) == errno.EADDRINUSE else str(error)
+            raise TransportError(f"cannot listen on {listen}: {reason}; choose another with --listen") from error
 
 
 class _Run:

@@ -119,6 +119,6 @@ def _path(wanted: type, value: Any) -> Any:
 
 
 def _suggestion(key: str, place: str, names: list[str]) -> str:
-    near = difflib.get_close_matches(key, names, n=3, cutoff=0.5)
+    near = difflib.get_close_matches(key, names, n=2, cutoff=0.6)
     known = [f"{place}{name}" for name in near or names]
     return f"did you mean {' or '.join(known)}?" if near else f"there are {', '.join(known)}"

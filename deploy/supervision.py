@@ -73,7 +73,7 @@ class Supervisor:
 
     def __init__(self, folder: Path, programs: Sequence[Program]) -> None:
         self.restarts: dict[str, int] = {}
-        self._folder = folder
+        self._folder = folder = folder.resolve()
         self._programs = programs
         self._socket = folder / "supervisor.sock"
         self._pids: dict[str, int] = {}
@@ -85,12 +85,13 @@ class Supervisor:
         if len(str(self._socket)) > _LONGEST_SOCKET_PATH:
             raise ProcessError(f"{self._folder}: too long a path for a socket; set TMPDIR to a shorter one")
         config = self._folder / "supervisord.conf"
-        config.write_text(configuration(self._folder, self._programs), encoding="utf-8")
+        config.write_text(configuration(self._programs), encoding="utf-8")
         with (self._folder / "supervisord.out").open("wb") as output:
             self._daemon = subprocess.Popen(
                 [sys.executable, "-P", "-m", "deploy.supervisord", "-c", str(config)],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
+                cwd=self._folder,
                 stderr=subprocess.STDOUT,
                 env={**child_environment(), PARENT: str(os.getpid())},
                 # A Ctrl-C at the terminal is for the command, which then stops the processes in order.
@@ -208,23 +209,23 @@ class Supervisor:
             self._daemon.wait()
 
 
-def configuration(folder: Path, programs: Sequence[Program]) -> str:
-    """The file that supervisord reads."""
+def configuration(programs: Sequence[Program]) -> str:
+    """The file that supervisord reads; its own files are relative to the folder that it runs in."""
     values: dict[str, dict[str, object]] = {
-        "unix_http_server": {"file": folder / "supervisor.sock", "chmod": "0700"},
+        "unix_http_server": {"file": "supervisor.sock", "chmod": "0700"},
         "supervisord": {
             "nodaemon": "true",
             "silent": "true",
-            "logfile": folder / "supervisord.log",
-            "pidfile": folder / "supervisord.pid",
-            "childlogdir": folder,
+            "logfile": "supervisord.log",
+            "pidfile": "supervisord.pid",
+            "childlogdir": ".",
         },
         "rpcinterface:supervisor": {
             "supervisor.rpcinterface_factory": "supervisor.rpcinterface:make_main_rpcinterface"
         },
     }
     for program in programs:
-        values[f"program:{program.name}"] = _program(folder, program)
+        values[f"program:{program.name}"] = _program(program)
     return "\n".join(_section(name, content) for name, content in values.items())
 
 
@@ -235,11 +236,12 @@ def child_environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths))}
 
 
-def _program(folder: Path, program: Program) -> dict[str, object]:
+def _program(program: Program) -> dict[str, object]:
     environment = ",".join(f'{name}="{value}"' for name, value in program.environment.items())
     return {
         "command": shlex.join(program.command),
         "environment": environment,
+        "directory": Path.cwd(),
         "autorestart": "unexpected",
         "exitcodes": f"0,{USER_ERROR}" if program.ends else USER_ERROR,
         # Up as soon as it is started: a bad start is told by the exit code, and `check` counts the others.
@@ -249,7 +251,7 @@ def _program(folder: Path, program: Program) -> dict[str, object]:
         "stopasgroup": "true",
         "killasgroup": "true",
         "redirect_stderr": "true",
-        "stdout_logfile": folder / f"{program.name}.log",
+        "stdout_logfile": f"{program.name}.log",
         "stdout_logfile_maxbytes": "10MB",
         "stdout_logfile_backups": 1,
     }

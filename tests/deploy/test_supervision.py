@@ -1,0 +1,125 @@
+"""Processes are started, brought back when they die, and ended with whoever started them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from deploy.errors import ProcessError
+from deploy.supervision import USER_ERROR, Program, Supervisor, child_environment
+
+SLEEP = "import time; print('up', flush=True); time.sleep(60)"
+STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {SLEEP}"
+
+
+def python(name: str, code: str, **options: object) -> Program:
+    return Program(name, [sys.executable, "-c", code], **options)  # type: ignore[arg-type]
+
+
+def until(condition: Callable[[], object], timeout_s: float = 10.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline, "it did not happen in time"
+        time.sleep(0.02)
+
+
+def test_one_that_is_killed_comes_back_and_is_counted(tmp_path: Path) -> None:
+    with Supervisor(tmp_path, [python("a", SLEEP), python("b", SLEEP)]) as supervisor:
+        first = supervisor.poll()
+        os.kill(first["a"].pid, signal.SIGKILL)
+        until(lambda: supervisor.poll() and supervisor.restarts)
+        second = supervisor.check(restart_limit=1)
+        assert second["a"].pid not in (0, first["a"].pid)
+        assert second["b"].pid == first["b"].pid
+        assert supervisor.restarts == {"a": 1}
+    assert not psutil.pid_exists(second["a"].pid)
+    assert not psutil.pid_exists(second["b"].pid)
+
+
+def test_one_that_dies_again_and_again_is_an_error_with_its_last_words(tmp_path: Path) -> None:
+    program = python("a", "import sys; print('out of cheese'); sys.exit(7)")
+    with (
+        Supervisor(tmp_path, [program]) as supervisor,
+        pytest.raises(ProcessError, match="a does not stay up: out of cheese; its log is"),
+    ):
+        until(lambda: supervisor.check(restart_limit=2) is None)
+
+
+def test_a_users_mistake_is_told_at_once_and_not_tried_again(tmp_path: Path) -> None:
+    program = python("a", f"import sys; print('fieldpose: no such thing'); sys.exit({USER_ERROR})")
+    with Supervisor(tmp_path, [program]) as supervisor:
+        until(lambda: supervisor.poll()["a"].given_up)
+        with pytest.raises(ProcessError, match=r"^a: no such thing$"):
+            supervisor.check(restart_limit=2)
+        assert supervisor.restarts == {}
+
+
+def test_only_one_that_may_end_stays_down_after_its_work(tmp_path: Path) -> None:
+    programs = [python("camera", "pass", ends=True), python("stage", "pass")]
+    with Supervisor(tmp_path, programs) as supervisor:
+        until(lambda: supervisor.poll()["camera"].finished)
+        until(lambda: supervisor.poll() and supervisor.restarts.get("stage", 0) >= 2)
+        assert "camera" not in supervisor.restarts
+
+
+def test_those_that_do_not_listen_are_killed_after_the_timeout(tmp_path: Path) -> None:
+    programs = [python("good", SLEEP), python("bad", STUBBORN, stop_s=30.0)]
+    with Supervisor(tmp_path, programs) as supervisor:
+        until(lambda: all("up" in supervisor.last_line(name) for name in ("good", "bad")))
+        pid = supervisor.poll()["bad"].pid
+        began = time.monotonic()
+        assert supervisor.stop(["good"], timeout_s=5.0)
+        assert not supervisor.stop(["bad"], timeout_s=0.3)
+        assert time.monotonic() - began < 3.0
+        until(lambda: not psutil.pid_exists(pid))
+
+
+def test_all_end_when_whoever_started_them_is_killed(tmp_path: Path) -> None:
+    code = f"""
+import sys, time
+from pathlib import Path
+from deploy.supervision import Program, Supervisor
+if __name__ == "__main__":
+    with Supervisor(Path({str(tmp_path)!r}), [Program("a", [sys.executable, "-c", {SLEEP!r}])]) as supervisor:
+        while not supervisor.poll()["a"].pid:
+            time.sleep(0.02)
+        print(supervisor.poll()["a"].pid, flush=True)
+        time.sleep(60)
+"""
+    parent = subprocess.Popen([sys.executable, "-c", code], env=child_environment(), stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    child = int(parent.stdout.readline())
+    parent.kill()
+    parent.wait()
+    until(lambda: not psutil.pid_exists(child))
+
+
+def test_the_environment_reaches_the_process_and_odd_characters_survive(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "100 % odd"
+    folder.mkdir()
+    program = Program(
+        "a",
+        [sys.executable, "-c", "import os, sys; print(os.environ['X'], sys.argv[1], os.getcwd())", "50%; 'x y'"],
+        {"X": "a%b"},
+    )
+    monkeypatch.chdir(folder)
+    with Supervisor(folder, [program]) as supervisor:
+        until(lambda: "it said nothing" not in supervisor.last_line("a"))
+        assert supervisor.last_line("a") == f"a%b 50%; 'x y' {folder}"
+
+
+def test_a_folder_too_deep_for_a_socket_is_told(tmp_path: Path) -> None:
+    folder = tmp_path / ("deep" * 30)
+    folder.mkdir()
+    with pytest.raises(ProcessError, match="too long a path for a socket"), Supervisor(folder, []):
+        pass

@@ -1,0 +1,101 @@
+"""One image without a bus: through the cores, and by the `estimate` command on the embedded scene."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.analytic_scene import AnalyticScene, camera, viewpoint
+
+from bus.messages import Reason
+from deploy.cli import main
+from deploy.scene import demo_file
+from deploy.settings import Settings, changed
+from deploy.single import PoseFinder
+from stages.geometry import perturb, rotation_error_deg, translation_error
+from stages.nerf.datasets import load_dataset
+
+SETTINGS = changed(Settings(), {"matching": {"matcher": "sift"}, "refinement": {"steps": 0}}, "test")
+
+
+@pytest.fixture(scope="module")
+def scene() -> AnalyticScene:
+    return AnalyticScene()
+
+
+def test_a_pose_is_found_over_several_passes(scene: AnalyticScene) -> None:
+    truth, seen_by = viewpoint(), camera(240)
+    image = scene.render_view(seen_by, truth).rgb
+    guess = perturb(truth, np.random.default_rng(1), (8.0, 8.0), 0.1)
+    found = PoseFinder(scene, SETTINGS, scale=4.0).find(image, seen_by, guess)
+    assert found.reason is Reason.OK
+    assert found.cam_from_object is not None
+    assert found.passes >= 2
+    assert rotation_error_deg(found.cam_from_object, truth) < 0.5
+    assert translation_error(found.cam_from_object, truth) < 0.03
+    assert set(found.stage_ms) == {"rendering", "matching", "lifting", "pnp", "refinement"}
+
+
+def test_each_way_to_fail_has_its_reason(scene: AnalyticScene) -> None:
+    truth, seen_by = viewpoint(), camera(120)
+    away = truth.copy()
+    away[2, 3] = -50.0
+    blank = np.full((120, 120, 3), 255, np.uint8)
+    finder = PoseFinder(scene, SETTINGS, scale=4.0)
+    assert finder.find(blank, seen_by, away).reason is Reason.NOTHING_IN_VIEW
+    assert finder.find(blank, seen_by, truth).reason is Reason.TOO_FEW_MATCHES
+    strict = replace(SETTINGS, lifting=replace(SETTINGS.lifting, min_kept=10_000))
+    image = scene.render_view(seen_by, truth).rgb
+    found = PoseFinder(scene, strict, scale=4.0).find(image, seen_by, truth)
+    assert found.reason is Reason.TOO_FEW_CONSISTENT_POINTS
+    assert not found.ok
+
+
+def test_estimate_on_the_embedded_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    field = demo_file("field.safetensors")
+    dataset = load_dataset(field.parent, "test")
+    record = dataset.images[1]
+    out, picture = tmp_path / "pose.json", tmp_path / "over.jpg"
+    small = ["--rendering.size", "200", "--matching.matcher", "sift"]
+    arguments = ["estimate", str(field), str(record.path), "--guess", "train:047", *small]
+    assert main([*arguments, "--json", str(out), "--overlay", str(picture)]) == 0
+    found = json.loads(out.read_text())
+    pose = np.array(found["cam_from_object"])
+    assert rotation_error_deg(pose, record.cam_from_object) < 1.0
+    assert translation_error(pose, record.cam_from_object) < 0.05
+    assert found["ok"]
+    assert np.array(found["covariance"]).shape == (6, 6)
+    assert cv2.imread(str(picture)).shape == (record.camera.height, record.camera.width, 3)
+    assert "points agree" in capsys.readouterr().out
+
+
+def test_estimate_without_a_pose_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = tmp_path / "grey.png"
+    cv2.imwrite(str(image), np.full((60, 80, 3), 127, np.uint8))
+    field = str(demo_file("field.safetensors"))
+    small = ["--rendering.size", "80", "--matching.matcher", "sift"]
+    assert main(["estimate", field, str(image), "--guess", "train:000", *small]) == 1
+    assert "no pose: too_few_matches" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["missing.png", "--guess", "train:000"], "missing.png"),
+        (["{field}", "--guess", "train:000"], "field.safetensors"),
+        (["{image}", "--guess", "train:nobody"], "no single image is named 'nobody'"),
+        (["{image}", "--guess", "nothing.json"], "nothing.json"),
+    ],
+)
+def test_estimates_mistakes_are_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    field = demo_file("field.safetensors")
+    image = field.parent / "images" / "test" / "001.jpg"
+    given = [argument.format(field=field, image=image) for argument in arguments]
+    assert main(["estimate", str(field), *given]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert said in lines[0]

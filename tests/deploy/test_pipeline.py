@@ -1,0 +1,144 @@
+"""The whole pipeline in real processes, on the embedded scene: killed stages, Ctrl-C, recordings, replay."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+from support.commands import command
+
+from bus.replay import info
+from deploy.cli import main
+from deploy.pipeline import Plan, Progress, programs, run_pipeline
+from deploy.processes import CAMERA, HUB, OBSERVER, RECORDER, STAGES, TABLE, thread_environment, threads_of
+from deploy.results import summarise
+from deploy.scene import demo_file
+from deploy.settings import Settings, changed
+from deploy.supervision import child_environment
+
+FRAMES = 8
+SMALL = {
+    "camera": {"pace": "lockstep", "frames": FRAMES},
+    "rendering": {"size": 128},
+    "tracking": {"guess": "perturb:4-8deg,0.05", "passes": 2, "min_deadline_ms": 1000.0, "max_deadline_ms": 20000.0},
+}
+
+
+def settings() -> Settings:
+    source = f"mcap:{demo_file('sequence.mcap')}"
+    made = changed(Settings(), SMALL, "test")
+    return replace(made, camera=replace(made.camera, source=source))
+
+
+def descendants() -> set[int]:
+    return {process.pid for process in psutil.Process().children(recursive=True)}
+
+
+def pid_of(stage: str) -> int:
+    """The process of a stage below this one."""
+    for process in psutil.Process().children(recursive=True):
+        words = process.cmdline()
+        if "stage" in words and words[words.index("stage") + 1] == stage:
+            return process.pid
+    raise AssertionError(f"{stage} is not running")
+
+
+def test_the_table_has_every_process_and_its_command(tmp_path: Path) -> None:
+    plan = Plan(Path("field"), settings(), record=tmp_path / "a.mcap")
+    made = {program.name: program for program in programs(plan, tmp_path, "tcp/127.0.0.1:1")}
+    assert set(made) == set(TABLE) == {HUB, RECORDER, *STAGES}
+    assert made[CAMERA].ends
+    assert not any(program.ends for name, program in made.items() if name != CAMERA)
+    waits = made[CAMERA].command[list(made[CAMERA].command).index("--wait-for") + 1 :]
+    assert set(waits) == {OBSERVER, RECORDER, *STAGES} - {CAMERA}
+    assert "--record" not in made["matching"].command
+    assert made["matching"].environment["OMP_NUM_THREADS"] == made["matching"].environment["NUMBA_NUM_THREADS"]
+    without = Plan(Path("field"), settings())
+    assert RECORDER not in {program.name for program in programs(without, tmp_path, "tcp/127.0.0.1:1")}
+
+
+def test_threads_are_shared_between_the_processes_at_work() -> None:
+    assert threads_of(TABLE["rendering"], depth=2, cores=2) == 1
+    assert threads_of(TABLE["rendering"], depth=1, cores=2) == 2
+    assert threads_of(TABLE["matching"], depth=2, cores=16) == 8
+    assert threads_of(TABLE["pnp"], depth=1, cores=16) == 1
+    assert set(thread_environment(3).values()) == {"3", "passive", "0"}
+
+
+@pytest.mark.slow
+def test_a_killed_stage_comes_back_and_the_run_ends_with_a_recording_to_replay(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = tmp_path / "run.mcap"
+    killed: list[int] = []
+
+    def kill_rendering(progress: Progress) -> None:
+        if not killed and progress.state is not None and progress.state.finished >= 2:
+            killed.append(pid_of("rendering"))
+            os.kill(killed[0], signal.SIGKILL)
+
+    plan = Plan(demo_file("field.safetensors"), settings(), recording)
+    run = run_pipeline(plan, kill_rendering)
+    assert killed
+    assert descendants() == set()
+    summary = summarise(run)
+    assert summary["restarts"] == {"rendering": 1}
+    assert summary["frames_sent"] == summary["frames"] == FRAMES
+    assert summary["frames_lost"] <= 1
+    assert summary["poses_ok"] >= FRAMES - 2
+    assert summary["rotation_error_deg"]["median"] < 0.5
+    assert summary["translation_error"]["median"] < 0.05
+    assert summary["latency_ms"]["p50"] > 0
+    held = info(recording)
+    assert summary["messages"] == {"recorded": held.messages, "lost": 0}
+    assert held.lossless
+    by_topic = {topic.topic: topic.messages for topic in held.topics if topic.topic != "stats"}
+    assert by_topic["frame"] == by_topic["truth"] == by_topic["state"] == FRAMES
+    assert set(by_topic) == {
+        "frame", "truth", "guess", "view", "matches", "correspondences", "estimate", "pose", "state",
+    }  # fmt: skip
+    assert set(held.attachments) == {"settings.json", "field.safetensors"}
+
+    figures = tmp_path / "replay.json"
+    assert main(["replay", str(recording), "--json", str(figures)]) == 0
+    compared = json.loads(figures.read_text())
+    assert compared["compared"] == summary["poses_ok"]
+    assert compared["rotation_difference_deg"]["median"] < 0.1
+    assert compared["replay"]["frames_lost"] == 0
+    assert "from the recorded poses, rotation" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_every_process_within_5_s_and_leaves_a_whole_recording(tmp_path: Path) -> None:
+    recording, figures = tmp_path / "run.mcap", tmp_path / "run.json"
+    source = f"mcap:{demo_file('sequence.mcap')}"
+    arguments = ["--source", source, "--guess", "train:047", "--rendering.size", "128", "--record", str(recording)]
+    running = subprocess.Popen(
+        command("run", demo_file("field.safetensors"), *arguments, "--json", figures),
+        env=child_environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert running.stderr is not None
+    for line in running.stderr:
+        if line.endswith("running\n"):
+            break
+    time.sleep(1.5)
+    processes = psutil.Process(running.pid).children(recursive=True)
+    assert len(processes) >= len(TABLE)
+    began = time.monotonic()
+    running.send_signal(signal.SIGINT)
+    assert running.wait(timeout=20) == 130
+    assert time.monotonic() - began < 5.0
+    running.stderr.close()
+    assert not any(process.is_running() for process in processes)
+    assert info(recording).lossless
+    assert json.loads(figures.read_text())["frames_sent"] > 0

@@ -1,0 +1,148 @@
+"""Figures of a run: from messages on a bus to the keys that programs rely on."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import io
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from support import bus_samples
+
+from bus.memory import MemoryBus
+from bus.messages import Header, Pose, Reason, State, TrackingState
+from bus.ports import Outbox, first_header
+from bus.replay import RecordingInfo, SourceInfo, TopicInfo
+from bus.topics import CORRESPONDENCES, ESTIMATE, FRAME, GUESS, MATCHES, POSE, STATE, STATS, TRUTH, VIEW, Address
+from deploy.collector import Collector
+from deploy.results import FrameResult, RunResult, TruthKnown, accuracy, rate_hz, summarise, to_csv
+from stages.geometry import exp_se3
+
+ADDRESS = Address("test", "mug", "cam")
+
+
+def moved(turn_deg: float = 0.0, shift: float = 0.0) -> np.ndarray:
+    return exp_se3(np.array([0, 0, 0, 0, np.deg2rad(turn_deg), 0.0])) @ exp_se3(np.array([shift, 0, 0, 0, 0, 0.0]))
+
+
+def result(frame_id: int, turn_deg: float | None, shift: float = 0.0, **values: object) -> FrameResult:
+    pose = None if turn_deg is None else moved(turn_deg, shift)
+    defaults: dict[str, object] = {
+        "truth": TruthKnown(np.eye(4)), "sent_ns": frame_id * 10**9, "answered_ns": frame_id * 10**9 + 10**8,
+    }  # fmt: skip
+    return FrameResult(frame_id, frame_id, "finished", cam_from_object=pose, **(defaults | values))  # type: ignore[arg-type]
+
+
+def test_a_frame_without_a_pose_counts_as_a_failure() -> None:
+    figures = accuracy([result(0, 1.0, 0.01), result(1, 4.0, 0.2), result(2, 20.0), result(3, None)])
+    assert figures["frames_with_truth"] == 4
+    assert figures["share_re_below_5deg"] == pytest.approx(2 / 4)
+    assert figures["share_te_below_0.05"] == pytest.approx(2 / 4)
+    assert figures["rotation_error_deg"]["median"] == pytest.approx(4.0, abs=1e-6)
+    assert figures["rotation_error_deg"]["mean"] == pytest.approx(25 / 3, abs=1e-6)
+
+
+def test_without_truth_there_are_no_errors_and_out_of_view_is_no_failure() -> None:
+    unknown = accuracy([result(0, 1.0, truth=None)])
+    assert unknown["rotation_error_deg"] is None
+    assert unknown["share_re_below_5deg"] is None
+    away = accuracy([result(0, 1.0, truth=TruthKnown(None)), result(1, None, truth=TruthKnown(None)), result(2, 0.0)])
+    assert away["out_of_view"] == {"frames": 2, "poses_ok": 1}
+    assert away["frames_with_truth"] == 1
+    assert away["share_re_below_5deg"] == 1.0
+
+
+def test_the_rate_is_over_the_time_from_first_sent_to_last_answered() -> None:
+    assert rate_hz([result(i, 0.0) for i in range(5)]) == pytest.approx(5 / 4.1)
+    assert rate_hz([]) == 0.0
+
+
+def test_lost_messages_are_those_the_numbers_lack_or_only_the_command_has_heard() -> None:
+    topics = [TopicInfo("a", "pose", 8, 0, 1, 1.0), TopicInfo("b", "view", 10, 0, 1, 1.0)]
+    sources = [SourceInfo("a", "x", 8, 8, 2), SourceInfo("b", "y", 12, 10, 0)]
+    recording = RecordingInfo("f", 1, 18, 0, 1, False, topics, sources)
+    run = RunResult([], recording=recording, observed={"a": 9, "b": 15, "c": 1})
+    assert summarise(run)["messages"] == {"recorded": 18, "lost": 2 + 5 + 1}
+    assert summarise(RunResult([]))["messages"] == {"recorded": 0, "lost": 0}
+
+
+def test_the_rows_hold_pose_and_errors() -> None:
+    rows = list(csv.DictReader(io.StringIO(to_csv([result(3, 2.0, 0.0), result(4, None)]).decode())))
+    assert float(rows[0]["rotation_error_deg"]) == pytest.approx(2.0, abs=1e-6)
+    assert float(rows[0]["cam_from_object_00"]) == pytest.approx(np.cos(np.deg2rad(2)))
+    assert rows[1]["cam_from_object_00"] == rows[1]["rotation_error_deg"] == ""
+
+
+@pytest.fixture
+def collected() -> Iterator[tuple[Collector, dict[str, Outbox]]]:
+    bus = MemoryBus()
+    collector = Collector(bus, ADDRESS)
+    yield collector, {name: Outbox(bus, ADDRESS, name) for name in ("camera", "stage", "tracking")}
+    collector.close()
+
+
+def state(header: Header, pose: np.ndarray | None, score: float) -> State:
+    return State(
+        header=header, state=TrackingState.TRACKING, score=score, cam_from_object=pose, covariance=None, in_flight=0,
+        admitted=1, finished=1, dropped_at_the_door=0, lost=0,
+    )  # fmt: skip
+
+
+def pose(header: Header) -> Pose:
+    return Pose(
+        header=header, ok=True, reason=Reason.OK, cam_from_object=np.eye(4), covariance=None, inliers=9,
+        correspondences=9, residual_px=1.0, refined=False, loss_before=None, loss_after=None,
+    )  # fmt: skip
+
+
+def one_pass(outboxes: dict[str, Outbox], frame_id: int, pass_index: int = 0) -> None:
+    header = first_header(frame_id, 1000 + frame_id, pass_index)
+    samples = bus_samples.every_message()
+    for topic in (GUESS, VIEW, MATCHES, CORRESPONDENCES, ESTIMATE):
+        message = copy.copy(samples[topic])
+        message.header = header
+        outboxes["stage"].publish(topic, message)
+    outboxes["stage"].publish(POSE, pose(header))
+
+
+def test_what_goes_over_the_bus_becomes_rows(collected: tuple[Collector, dict[str, Outbox]]) -> None:
+    collector, outboxes = collected
+    for frame_id in range(4):
+        outboxes["camera"].publish(FRAME, bus_samples.frame(frame_id))
+        outboxes["camera"].publish(TRUTH, bus_samples.truth(frame_id))
+    for pass_index in (0, 1):
+        one_pass(outboxes, 0, pass_index)
+    outboxes["tracking"].publish(STATE, state(first_header(0, 1000, 1), np.eye(4), 0.9))
+    one_pass(outboxes, 1)
+    outboxes["tracking"].publish(STATE, state(first_header(1, 1001), np.eye(4), 0.0))
+    outboxes["stage"].publish(GUESS, bus_samples.guess(2))
+    outboxes["tracking"].publish(STATE, state(first_header(2, 1002), np.eye(4), 0.5))
+    collector.update()
+    rows = collector.results()
+    assert [row.outcome for row in rows] == ["finished", "finished", "lost", "dropped"]
+    assert [row.passes for row in rows[:3]] == [2, 1, 1]
+    assert [row.cam_from_object is not None for row in rows] == [True, False, False, False]
+    assert rows[0].errors == pytest.approx((0.0, 0.0), abs=1e-6)
+    assert set(rows[0].stage_ms) == {"tracking", "rendering", "matching", "lifting", "pnp", "refinement"}
+    total = rows[0].latency_ms
+    assert total is not None
+    assert sum(rows[0].stage_ms.values()) == pytest.approx(total, rel=1e-6)
+    assert rows[2].latency_ms is None
+
+
+def test_the_documented_keys_are_there(collected: tuple[Collector, dict[str, Outbox]]) -> None:
+    collector, outboxes = collected
+    outboxes["camera"].publish(FRAME, bus_samples.frame(0))
+    one_pass(outboxes, 0)
+    outboxes["tracking"].publish(STATE, state(first_header(0, 1000), np.eye(4), 0.9))
+    outboxes["stage"].publish(STATS, bus_samples.every_message()[STATS])
+    collector.update()
+    summary = summarise(RunResult(collector.results(), collector.stats, collector.observed, {"pnp": 2}))
+    assert summary["frames"] == summary["poses_ok"] == summary["frames_sent"] == 1
+    assert summary["restarts"] == {"pnp": 2}
+    assert set(summary["latency_ms"]) == {"p50", "p90", "p99", "by_stage"}
+    assert set(summary["latency_ms"]["by_stage"]["matching"]) == {"p50", "p90"}
+    assert summary["processes"]["pnp"]["rss_mb"] > 0
+    assert collector.rate_hz(collector.results()[0].answered_ns or 0) > 0

@@ -1,0 +1,95 @@
+"""Pictures and videos of a run: the field lies over the camera's image where the pose says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.analytic_scene import AnalyticScene, camera, viewpoint
+from support.chain import frame_message
+
+from bus.messages import Header
+from bus.recording import RecordingWriter
+from bus.topics import FRAME, Address
+from deploy.errors import OutputError
+from deploy.output import check_writable, write_bytes, write_json
+from deploy.overlay import EDGE_RGB, encoded, overlaid
+from deploy.results import FrameResult, TruthKnown
+from deploy.showing import pictures, write_video
+from stages.geometry import perturb
+
+CAMERA = camera(64)
+FRAME_NS = 100_000_000
+
+
+@pytest.fixture(scope="module")
+def scene() -> AnalyticScene:
+    return AnalyticScene()
+
+
+def test_the_outline_lies_on_the_image_only_where_the_pose_is_right(scene: AnalyticScene) -> None:
+    seen_by = camera(160)
+    truth = viewpoint()
+    image = scene.render_view(seen_by, truth).rgb
+    beside = perturb(truth, np.random.default_rng(0), (10.0, 10.0))
+
+    def fit(pose: np.ndarray) -> float:
+        drawn = overlaid(image, scene.render_view(seen_by, pose))
+        edges = cv2.Canny(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), 80, 180) > 0
+        return float(edges[(drawn == EDGE_RGB).all(axis=2)].mean())
+
+    assert fit(truth) > 2 * fit(beside)
+
+
+def recorded(path: Path, scene: AnalyticScene, count: int) -> list[FrameResult]:
+    """A recording of frames, and results of all but the last; the second has no pose."""
+    writer = RecordingWriter(path)
+    results = []
+    for i in range(count):
+        pose = viewpoint(azimuth_deg=20.0 + i)
+        frame = frame_message(scene.render_view(CAMERA, pose).rgb, CAMERA, i)
+        frame.header = Header("camera", i, i, 0, i * FRAME_NS, i * FRAME_NS)
+        writer.write(Address().key(FRAME), FRAME, frame, i * FRAME_NS)
+        found, score = (None, 0.0) if i == 1 else (pose, 0.5 + 0.1 * i)
+        result = FrameResult(
+            i, i * FRAME_NS, "finished" if i < count - 1 else "dropped", state="tracking", score=score,
+            cam_from_object=found, truth=TruthKnown(pose),
+        )  # fmt: skip
+        results.append(result)
+    writer.close()
+    return results
+
+
+def test_a_video_shows_each_finished_frame_until_the_next(tmp_path: Path, scene: AnalyticScene) -> None:
+    results = recorded(tmp_path / "a.mcap", scene, 4)
+    told: list[tuple[int, int]] = []
+    shown = pictures(tmp_path / "a.mcap", results, scene, lambda done, total: told.append((done, total)))
+    best = write_video(tmp_path / "a.mp4", shown)
+    assert told[-1] == (3, 3)
+    assert best is not None
+    assert best.result.frame_id == 2
+    video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    assert (video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (128, 64)
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3 + 3 + 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "a.mp4"]
+
+
+def test_no_finished_frame_makes_no_video(tmp_path: Path) -> None:
+    assert write_video(tmp_path / "a.mp4", iter(())) is None
+    assert not (tmp_path / "a.mp4").exists()
+
+
+def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
+    write_json(tmp_path / "new" / "a.json", {"x": [1, 2]})
+    assert (tmp_path / "new" / "a.json").read_text().startswith('{\n  "x"')
+    with pytest.raises(OutputError, match="cannot be written"):
+        write_bytes(tmp_path / "new", b"over a folder")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a.json", "new"]
+    with pytest.raises(OutputError, match=r"end it in \.jpg or \.png"):
+        encoded(np.zeros((4, 4, 3), np.uint8), Path("a.what"))
+    with pytest.raises(OutputError, match="is a folder"):
+        check_writable(tmp_path)
+    with pytest.raises(OutputError, match="its folder cannot be made"):
+        check_writable(tmp_path / "new" / "a.json" / "b.json")

@@ -81,7 +81,7 @@ class ZenohBus:
             with self._declaring:
                 publisher = self._publishers.get(key)
                 if publisher is None:
-                    priority = _PRIORITIES[topic.priority] if topic is not None else zenoh.Priority.INTERACTIVE_HIGH
+                    priority = _PRIORITIES[topic.priority] if topic is not None else zenoh.Priority.DATA
                     publisher = self._session.declare_publisher(key, priority=priority, congestion_control=_CONGESTION)
                     self._publishers[key] = publisher
             publisher.put(payload)
@@ -119,7 +119,21 @@ class ZenohBus:
         self._session.close()
 
     def _open_presence(self, name: str) -> Presence:
-        presence = Presence(name, lambda word: self.put(f"peers/{name}", word))
+        # Its own words must not come back: while it answers nobody empties its queue, and a full one would block it.
+        voice = self._session.declare_publisher(
+            f"peers/{name}",
+            priority=zenoh.Priority.INTERACTIVE_HIGH,
+            congestion_control=_CONGESTION,
+            allowed_destination=zenoh.Locality.REMOTE,
+        )
+
+        def say(word: bytes) -> None:
+            try:
+                voice.put(word)
+            except zenoh.ZError as error:
+                raise TransportError(f"cannot send on the bus: {_reason(error)}") from error
+
+        presence = Presence(name, say)
         self.subscribe("peers/*", lambda key, payload, _: presence.heard(key.rsplit("/", 1)[1], payload), 256)
 
         def changed(event: Any) -> None:

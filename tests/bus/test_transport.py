@@ -246,6 +246,24 @@ class TestProcesses:
         second.terminate()
         assert second.wait(5.0) == 0
 
+    def test_a_flood_of_greetings_stops_nobody(self, hub: str, connect: Connect) -> None:
+        bus, crowd = connect(hub), connect(hub)
+        meet(crowd, bus)
+        greeting = b'{"held": [], "number": 1}' + b" " * 8192
+        held = threading.Event()
+
+        def hold() -> None:
+            for number in range(20):
+                bus.hold(ADDRESS.live(f"stage{number}")).close()
+            held.set()
+
+        holder = threading.Thread(target=hold, daemon=True)
+        for number in range(1500):
+            crowd.put(f"peers/{number % 40:032x}", greeting)
+            if number == 300:
+                holder.start()
+        assert held.wait(20.0), "a session waits for itself"
+
     def test_images_pass_where_shared_memory_is_small(
         self, hub: str, connect: Connect, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -1,0 +1,40 @@
+"""The train command: a dataset in, a field and its figures out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from support import posed_images
+
+from deploy.cli import main
+from stages.nerf.field import load_field
+
+SMALL = [
+    "--model.levels", "2", "--model.log2-table", "8", "--model.hidden", "8", "--model.colour-hidden", "8",
+    "--model.occupancy-resolution", "16", "--model.finest-resolution", "32",
+]  # fmt: skip
+
+
+def test_a_field_is_learnt_measured_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    posed_images.write_blender(tmp_path / "data", posed_images.centred(32, 32, 40.0))
+    out, figures = tmp_path / "out" / "field.safetensors", tmp_path / "train.json"
+    arguments = ["train", str(tmp_path / "data"), "--out", str(out), "--size", "16", "--training.steps", "3"]
+    assert main([*arguments, *SMALL, "--json", str(figures)]) == 0
+    written = json.loads(figures.read_text())
+    metadata = load_field(out).metadata
+    assert written["steps"] == metadata.trained_steps == 3
+    assert len(written["psnr_db_by_view"]) == 3
+    assert written["psnr_db"] == pytest.approx(metadata.psnr_db)
+    assert not written["interrupted"]
+    assert {camera.width for camera in metadata.cameras} == {16}
+    assert metadata.config.levels == 2
+    said = capsys.readouterr()
+    assert f"{out}: {written['psnr_db']:.2f} dB on 3 held-out views" in said.out
+    assert "training: 0%, step 1, loss" in said.err
+
+
+def test_a_bad_place_for_the_field_is_told_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", str(tmp_path / "data"), "--out", str(tmp_path)]) == 2
+    assert "is a folder; give the name of a file" in capsys.readouterr().err

@@ -13,7 +13,7 @@ from bus import topics
 from bus.codec import decode_header
 from bus.errors import CodecError
 from bus.messages import Header, Message, Pose, State, Stats, Truth
-from bus.ports import Inbox
+from bus.ports import Inbox, Sequences
 from bus.protocol import Bus
 from bus.topics import FRAME, GUESS, POSE, STATE, STATS, TRUTH, Address, Topic
 from deploy.results import STAGE_OF, FrameResult, Outcome, TruthKnown
@@ -47,6 +47,7 @@ class Collector:
         self.newest_state: State | None = None
         self.observed: Counter[str] = Counter()
         self.sent = 0
+        self._numbers = Sequences(from_start=True)
         self._frames: OrderedDict[int, _Seen] = OrderedDict()
         self._headers: deque[tuple[Topic, Header]] = deque()
         self._reported_ns: deque[int] = deque()
@@ -80,15 +81,18 @@ class Collector:
 
     def _timed(self, topic: Topic, key: str, payload: bytes, received_ns: int) -> None:
         try:
-            self._headers.append((topic, decode_header(payload)))
+            header = decode_header(payload)
         except CodecError:
             return  # the stages refuse and count it
         self.observed[key] += 1
+        if topic is FRAME:
+            # By the camera's own numbers: where this process is kept from running, it may miss some.
+            self.sent += 1 + self._numbers.seen(key, header)
+        self._headers.append((topic, header))
 
     def _note_header(self, topic: Topic, header: Header) -> None:
         seen = self._seen(header)
         if topic is FRAME:
-            self.sent += 1
             seen.camera_sent_ns = header.sent_ns
         else:
             seen.sent_ns.setdefault(header.pass_index, {})[topic.name] = header.sent_ns

@@ -152,6 +152,7 @@ class _Run:
             bus.close()
         return RunResult(
             frames=collector.results(),
+            sent=collector.sent,
             stats=collector.stats,
             observed=collector.observed,
             restarts=dict(self._supervisor.restarts),

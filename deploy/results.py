@@ -105,11 +105,12 @@ class FrameResult:
 class RunResult:
     """What a run has left: its frames, and what was heard of its processes.
 
-    `observed`: messages that the command itself has heard, by key; `interrupted`: by Ctrl-C or SIGTERM, before the
-    source had ended; `start_s`: until all processes were ready.
+    `sent`: frames by the camera's own numbers; `observed`: messages that the command itself has heard, by key;
+    `interrupted`: by Ctrl-C or SIGTERM, before the source had ended; `start_s`: until all processes were ready.
     """
 
     frames: Sequence[FrameResult]
+    sent: int = 0
     stats: Mapping[str, Stats] = field(default_factory=dict)
     observed: Mapping[str, int] = field(default_factory=dict)
     restarts: Mapping[str, int] = field(default_factory=dict)
@@ -125,8 +126,8 @@ def summarise(run: RunResult) -> dict[str, Any]:
     return {
         "frames": len(admitted),
         "frames_lost": sum(result.outcome == "lost" for result in admitted),
-        "frames_sent": sum(result.sent_ns is not None for result in run.frames),
-        "dropped_at_the_door": sum(result.outcome == "dropped" for result in run.frames),
+        "frames_sent": run.sent,
+        "dropped_at_the_door": run.sent - len(admitted),
         "poses_ok": sum(result.cam_from_object is not None for result in admitted),
         **accuracy(admitted),
         "rate_hz": rate_hz(admitted),

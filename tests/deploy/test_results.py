@@ -139,10 +139,26 @@ def test_the_documented_keys_are_there(collected: tuple[Collector, dict[str, Out
     outboxes["tracking"].publish(STATE, state(first_header(0, 1000), np.eye(4), 0.9))
     outboxes["stage"].publish(STATS, bus_samples.every_message()[STATS])
     collector.update()
-    summary = summarise(RunResult(collector.results(), collector.stats, collector.observed, {"pnp": 2}))
+    summary = summarise(RunResult(collector.results(), collector.sent, collector.stats, collector.observed, {"pnp": 2}))
     assert summary["frames"] == summary["poses_ok"] == summary["frames_sent"] == 1
     assert summary["restarts"] == {"pnp": 2}
     assert set(summary["latency_ms"]) == {"p50", "p90", "p99", "by_stage"}
     assert set(summary["latency_ms"]["by_stage"]["matching"]) == {"p50", "p90"}
     assert summary["processes"]["pnp"]["rss_mb"] > 0
     assert collector.rate_hz(collector.results()[0].answered_ns or 0) > 0
+
+
+def test_frames_that_the_command_has_not_heard_count_as_sent() -> None:
+    bus, kept = MemoryBus(), []
+    bus.subscribe(ADDRESS.key(FRAME), lambda key, payload, at: kept.append((key, payload)), 8)
+    outbox = Outbox(bus, ADDRESS, "camera")
+    for frame_id in range(5):
+        outbox.publish(FRAME, bus_samples.frame(frame_id))
+    listening = MemoryBus()
+    collector = Collector(listening, ADDRESS)
+    for heard in (1, 4):
+        listening.put(*kept[heard])
+    collector.update()
+    assert collector.sent == 5
+    assert len(collector.results()) == 2
+    collector.close()

@@ -45,8 +45,8 @@ def draw() -> str:
         parts.append(f'<text x="{x + WIDTH / 2}" y="{y + 31}" text-anchor="middle" fill="#123">{name}</text>')
     parts.append('<rect x="20" y="330" width="800" height="34" rx="8" fill="#eef1f4" stroke="#9ab"/>')
     parts.append(
-        '<text x="420" y="352" text-anchor="middle" fill="#345">Zenoh bus: every box is a process, every arrow a topic; the '
-        "MCAP recorder takes all of them</text>"
+        '<text x="420" y="352" text-anchor="middle" fill="#345">Zenoh bus: every box is a process, every arrow a '
+        "topic; the MCAP recorder takes all of them</text>"
     )
     parts.append('<text x="20" y="390" font-size="12" fill="#754">orange: renders the radiance field</text></svg>')
     return "\n".join(parts) + "\n"

@@ -18,7 +18,7 @@ from typing import Literal
 import psutil
 
 from bus.errors import FieldposeError
-from deploy.pipeline import free_port
+from deploy.endpoints import free_port
 from stages.errors import StageError
 
 _PACKAGES = ("torch", "kornia", "numba", "numpy", "opencv-python-headless", "eclipse-zenoh", "mcap", "supervisor")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import errno
-import re
 import shutil
-import socket
 import sys
 import tempfile
 import time
@@ -15,20 +12,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from bus.errors import RecordingError, TransportError
+from bus.errors import RecordingError
 from bus.messages import State
 from bus.recording import partial_path
 from bus.replay import RecordingInfo, info
 from bus.signals import StopSignals
 from bus.transport import ZenohBus
 from deploy.collector import Collector
+from deploy.endpoints import check_free, free_port, peer_address
 from deploy.errors import ProcessError
 from deploy.processes import CAMERA, HUB, OBSERVER, RECORDER, STAGES, TABLE, thread_environment, threads_of
 from deploy.results import RunResult
 from deploy.settings import Settings, to_json
 from deploy.supervision import Program, Supervisor
 
-_TCP = re.compile(r"(?:tcp|tls|ws|wss)/(?P<host>[\w.-]+):(?P<port>\d+)")
 _START_S = 300.0
 _RESTARTS_AT_START, _RESTARTS = 2, 10
 _POLL_S = 0.1
@@ -76,7 +73,7 @@ def run_pipeline(plan: Plan, report: Report = lambda progress: None) -> RunResul
     RecordingError for a recording that is in the way or could not be finished.
     """
     _check_recording(plan.record)
-    _check_free(plan.listen)
+    check_free(plan.listen)
     with StopSignals() as signals, _folder(plan.logs) as folder:
         hub = plan.listen or f"tcp/127.0.0.1:{free_port()}"
         with Supervisor(folder, programs(plan, folder, hub)) as supervisor:
@@ -106,28 +103,6 @@ def programs(plan: Plan, folder: Path, hub: str) -> list[Program]:
     return programs
 
 
-def free_port() -> int:
-    """A port of the loopback interface that nobody listens on now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
-def _check_free(listen: str | None) -> None:
-    """Raise TransportError where another program listens already; what is no address the hub will tell."""
-    found = None if listen is None else _TCP.fullmatch(listen)
-    if found is None:
-        return
-    with socket.socket() as probe:
-        # As the hub does; else a port would count as used for a minute after the last one.
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((found["host"], int(found["port"])))
-        except (OSError, OverflowError) as error:
-            reason = "the port is in use" if getattr(error, "errno", 0) == errno.EADDRINUSE else str(error)
-            raise TransportError(f"cannot listen on {listen}: {reason}; choose another with --listen") from error
-
-
 class _Run:
     def __init__(self, plan: Plan, supervisor: Supervisor, hub: str, signals: StopSignals, report: Report) -> None:
         self._plan = plan
@@ -139,7 +114,7 @@ class _Run:
 
     def run(self) -> RunResult:
         began = time.monotonic()
-        bus = ZenohBus(self._hub)
+        bus = ZenohBus(self._hub, peer_address(self._hub))
         try:
             collector = Collector(bus, self._plan.settings.address)
             token = bus.hold(self._plan.settings.address.live(OBSERVER))

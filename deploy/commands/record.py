@@ -14,6 +14,7 @@ from bus.recorder import Recorder
 from bus.signals import StopSignals
 from bus.topics import Address
 from bus.transport import LOCAL_HUB, ZenohBus
+from deploy.endpoints import peer_address
 from deploy.output import check_writable, progress_console
 
 _HUB_S = 5.0
@@ -40,7 +41,7 @@ class Options:
     def run(self) -> int:
         """Record, then say what was recorded."""
         check_writable(self.recording)
-        bus = ZenohBus(self.connect)
+        bus = ZenohBus(self.connect, peer_address(self.connect))
         try:
             bus.wait_for_hub(_HUB_S)
             recorder = Recorder(bus, self.address, self.recording)

@@ -14,6 +14,7 @@ import tyro
 
 from bus.node import Handler, run_node
 from bus.transport import LOCAL_HUB, ZenohBus, log_to_stderr, serve_hub, wait_for
+from deploy.endpoints import peer_address
 from deploy.lifeline import die_with_parent
 from deploy.processes import CAMERA, TABLE, Launch, ProcessSpec, thread_environment, threads_of
 from deploy.settings import Settings
@@ -38,7 +39,7 @@ class Options:
     """Where the hub is."""
     listen: str | None = None
     """Where this process listens: the hub for everybody (default: the address of --connect), any other for the
-    processes that it exchanges messages with (default: any port of this machine, for this machine alone)."""
+    processes that it exchanges messages with (default: any port, for this machine alone if the hub is on it)."""
     field: Path | None = None
     """The field, for the processes that need it: tracking, rendering, lifting, refinement."""
     record: Path | None = None
@@ -75,7 +76,7 @@ def _serve(options: Options, spec: ProcessSpec, make_handler: Callable[[Launch],
     address = options.settings.address
     if options.field is not None and spec.renders:
         compile_kernels(options.field, spec.name)
-    bus = ZenohBus(options.connect, options.listen) if options.listen else ZenohBus(options.connect)
+    bus = ZenohBus(options.connect, options.listen or peer_address(options.connect))
 
     def wait_until_ready() -> None:
         wait_for(bus, address, options.wait_for, _START_S)

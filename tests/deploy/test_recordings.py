@@ -15,7 +15,7 @@ from bus.replay import info
 from bus.topics import POSE, STATE, Address
 from bus.transport import ZenohBus, serve_hub
 from deploy.cli import main
-from deploy.pipeline import free_port
+from deploy.endpoints import free_port
 
 ADDRESS = Address("fieldpose", "mug", "cam")
 

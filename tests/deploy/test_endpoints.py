@@ -1,0 +1,33 @@
+"""Addresses: who listens where, and ports that are taken."""
+
+from __future__ import annotations
+
+import socket
+
+import pytest
+
+from bus.errors import TransportError
+from deploy.endpoints import check_free, free_port, peer_address
+
+
+@pytest.mark.parametrize("hub", ["tcp/127.0.0.1:7447", "tcp/localhost:1", "tls/[::1]:7447"])
+def test_around_a_hub_of_this_machine_nobody_listens_to_others(hub: str) -> None:
+    assert peer_address(hub) == "tcp/127.0.0.1:0"
+
+
+@pytest.mark.parametrize("hub", ["tcp/robot:7447", "tcp/10.0.0.2:7447", "tcp/0.0.0.0:7447"])
+def test_around_a_hub_for_others_everybody_can_be_reached(hub: str) -> None:
+    assert peer_address(hub) == "tcp/0.0.0.0:0"
+
+
+def test_a_port_is_free_until_someone_listens() -> None:
+    port = free_port()
+    check_free(f"tcp/127.0.0.1:{port}")
+    check_free(None)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", port))
+        taken.listen()
+        with pytest.raises(TransportError, match="the port is in use"):
+            check_free(f"tcp/127.0.0.1:{port}")
+    with pytest.raises(TransportError, match="cannot listen on tcp/127.0.0.1:99999"):
+        check_free("tcp/127.0.0.1:99999")

@@ -29,5 +29,5 @@ def test_a_port_is_free_until_someone_listens() -> None:
         taken.listen()
         with pytest.raises(TransportError, match="the port is in use"):
             check_free(f"tcp/127.0.0.1:{port}")
-    with pytest.raises(TransportError, match="cannot listen on tcp/127.0.0.1:99999"):
+    with pytest.raises(TransportError, match=r"cannot listen on .*99999"):
         check_free("tcp/127.0.0.1:99999")

@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import time
-from dataclasses import replace
+from contextlib import nullcontext
 from pathlib import Path
 
 import psutil
@@ -15,26 +15,19 @@ import pytest
 from support.commands import command
 
 from bus.replay import info
+from bus.topics import ALL
 from deploy.cli import main
-from deploy.pipeline import Plan, Progress, programs, run_pipeline
+from deploy.pipeline import Plan, Progress, programs
 from deploy.processes import CAMERA, HUB, OBSERVER, RECORDER, STAGES, TABLE, thread_environment, threads_of
-from deploy.results import summarise
 from deploy.scene import demo_file
-from deploy.settings import Settings, changed
+from deploy.settings import Settings
 from deploy.supervision import child_environment
 
 FRAMES = 8
-SMALL = {
-    "camera": {"pace": "lockstep", "frames": FRAMES},
-    "rendering": {"size": 128},
-    "tracking": {"guess": "perturb:4-8deg,0.05", "passes": 2, "min_deadline_ms": 1000.0, "max_deadline_ms": 20000.0},
-}
-
-
-def settings() -> Settings:
-    source = f"mcap:{demo_file('sequence.mcap')}"
-    made = changed(Settings(), SMALL, "test")
-    return replace(made, camera=replace(made.camera, source=source))
+SMALL = [
+    "--camera.pace", "lockstep", "--camera.frames", str(FRAMES), "--rendering.size", "128",
+    "--tracking.guess", "perturb:4-8deg,0.05", "--tracking.passes", "2", "--tracking.min-deadline-ms", "1000",
+]  # fmt: skip
 
 
 def descendants() -> set[int]:
@@ -51,7 +44,7 @@ def pid_of(stage: str) -> int:
 
 
 def test_the_table_has_every_process_and_its_command(tmp_path: Path) -> None:
-    plan = Plan(Path("field"), settings(), record=tmp_path / "a.mcap")
+    plan = Plan(Path("field"), Settings(), record=tmp_path / "a.mcap")
     made = {program.name: program for program in programs(plan, tmp_path, "tcp/127.0.0.1:1")}
     assert set(made) == set(TABLE) == {HUB, RECORDER, *STAGES}
     assert made[CAMERA].ends
@@ -60,7 +53,7 @@ def test_the_table_has_every_process_and_its_command(tmp_path: Path) -> None:
     assert set(waits) == {OBSERVER, RECORDER, *STAGES} - {CAMERA}
     assert "--record" not in made["matching"].command
     assert made["matching"].environment["OMP_NUM_THREADS"] == made["matching"].environment["NUMBA_NUM_THREADS"]
-    without = Plan(Path("field"), settings())
+    without = Plan(Path("field"), Settings())
     assert RECORDER not in {program.name for program in programs(without, tmp_path, "tcp/127.0.0.1:1")}
 
 
@@ -73,10 +66,9 @@ def test_threads_are_shared_between_the_processes_at_work() -> None:
 
 
 @pytest.mark.slow
-def test_a_killed_stage_comes_back_and_the_run_ends_with_a_recording_to_replay(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_stage_killed_in_the_demo_comes_back_and_the_recording_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    recording = tmp_path / "run.mcap"
     killed: list[int] = []
 
     def kill_rendering(progress: Progress) -> None:
@@ -84,11 +76,14 @@ def test_a_killed_stage_comes_back_and_the_run_ends_with_a_recording_to_replay(
             killed.append(pid_of("rendering"))
             os.kill(killed[0], signal.SIGKILL)
 
-    plan = Plan(demo_file("field.safetensors"), settings(), recording)
-    run = run_pipeline(plan, kill_rendering)
+    monkeypatch.setattr("deploy.commands.demo.live_line", lambda title: nullcontext(kill_rendering))
+    assert main(["demo", "--out", str(tmp_path), *SMALL]) == 0
     assert killed
     assert descendants() == set()
-    summary = summarise(run)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "summary.json", "recording.mcap", "overlay.jpg", "overlay.mp4",
+    }  # fmt: skip
+    summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["restarts"] == {"rendering": 1}
     assert summary["frames_sent"] == summary["frames"] == FRAMES
     assert summary["frames_lost"] <= 1
@@ -96,18 +91,18 @@ def test_a_killed_stage_comes_back_and_the_run_ends_with_a_recording_to_replay(
     assert summary["rotation_error_deg"]["median"] < 0.5
     assert summary["translation_error"]["median"] < 0.05
     assert summary["latency_ms"]["p50"] > 0
-    held = info(recording)
-    assert summary["messages"] == {"recorded": held.messages, "lost": 0}
+    held = info(tmp_path / "recording.mcap")
     assert held.lossless
+    assert summary["messages"] == {"recorded": held.messages, "lost": 0}
     by_topic = {topic.topic: topic.messages for topic in held.topics if topic.topic != "stats"}
     assert by_topic["frame"] == by_topic["truth"] == by_topic["state"] == FRAMES
-    assert set(by_topic) == {
-        "frame", "truth", "guess", "view", "matches", "correspondences", "estimate", "pose", "state",
-    }  # fmt: skip
+    assert by_topic.keys() == {topic.name for topic in ALL} - {"stats"}
     assert set(held.attachments) == {"settings.json", "field.safetensors"}
+    said = capsys.readouterr().out
+    assert "rendering 1x" in said
 
     figures = tmp_path / "replay.json"
-    assert main(["replay", str(recording), "--json", str(figures)]) == 0
+    assert main(["replay", str(tmp_path / "recording.mcap"), "--json", str(figures)]) == 0
     compared = json.loads(figures.read_text())
     assert compared["compared"] == summary["poses_ok"]
     assert compared["rotation_difference_deg"]["median"] < 0.1

@@ -9,13 +9,14 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 DEV := import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["dependency-groups"]["dev"], sep="\n")
 
-.PHONY: help install demo test lint clean
+.PHONY: help install demo test lint bench clean
 
 help:
 	@echo "make install   a virtual environment in $(VENV) with everything pinned"
 	@echo "make demo      the embedded scene through the whole pipeline; writes out/demo"
 	@echo "make test      lint, types, architecture, tests"
 	@echo "make lint      only the first three"
+	@echo "make bench     how fast rendering and training are here; half an hour, writes out/bench"
 
 install: $(INSTALLED)
 
@@ -38,6 +39,10 @@ lint: $(INSTALLED)
 
 test: lint
 	$(BIN)/pytest
+
+bench: $(INSTALLED)
+	$(BIN)/fieldpose bench render --json out/bench/render.json
+	$(BIN)/fieldpose bench train --json out/bench/train.json
 
 clean:
 	rm -rf out build *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache .import_linter_cache

@@ -90,8 +90,8 @@ class PoseFinder:
         kept = lifted.kept
         if kept.sum() < self._settings.lifting.min_kept:
             return PoseFound(Reason.TOO_FEW_CONSISTENT_POINTS, stage_ms=clock.ms)
-        pixels = matched.pixels_b[kept]
-        solved = clock.time("pnp", lambda: solve(pixels, lifted.points_in_object[kept], camera, self._settings.pnp))
+        pixels, points, confidence = matched.pixels_b[kept], lifted.points_in_object[kept], matched.confidence[kept]
+        solved = clock.time("pnp", lambda: solve(pixels, points, camera, self._settings.pnp, confidence))
         if solved.cam_from_object is None:
             return PoseFound(Reason(solved.reason), correspondences=len(pixels), stage_ms=clock.ms)
         pose = solved.cam_from_object

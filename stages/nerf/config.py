@@ -19,7 +19,7 @@ class FieldConfig:
     Fields for Real-Time View Synthesis", 2021).
     """
 
-    levels: int = 8
+    levels: int = 6
     """Resolutions of the hash grid."""
     level_features: int = 4
     """Features of a table entry."""
@@ -27,7 +27,7 @@ class FieldConfig:
     """Entries of a level's table, as a power of two; coarse levels that need fewer are stored densely."""
     base_resolution: int = 16
     finest_resolution: int = 1024
-    hidden: int = 64
+    hidden: int = 32
     """Width of the density network's hidden layer."""
     features: int = 15
     """Features composited along a ray; at least 3."""
@@ -48,12 +48,13 @@ class TrainingConfig:
     backend: Backend = "numba"
     """numba: compiled kernels on the CPU; cuda: torch on a CUDA device; torch: the same on the CPU, for comparison."""
     seed: int = 0
-    samples_per_step: int = 1 << 14
+    samples_per_step: int = 1 << 15
     """Rays are added to a step until they carry about so many samples."""
     learning_rate: float = 1e-2
     final_learning_rate: float = 5e-4
-    distortion: float = 1e-3
-    """Weight of the loss that gathers a ray's weights around one depth (Barron et al., "Mip-NeRF 360", 2022)."""
+    distortion: float | None = None
+    """Weight of the loss that gathers a ray's weights around one depth (Barron et al., "Mip-NeRF 360", 2022); by
+    default 0.01 for what lies in a box, 0.05 for unbounded scenes, whose rays are measured in shorter units."""
     huber_delta: float = 0.1
     threads: int = 0
     """Threads of the kernels; 0 takes all cores."""

@@ -46,10 +46,10 @@ class Field:
 
 def domain_of(space: Space, occupied: np.ndarray) -> Domain:
     """Pack the occupancy for the kernels."""
-    bits, coarse = pack(occupied)
+    bits, distance = pack(occupied)
     half = np.array(space.half, np.float32)
     return Domain(
-        space.contracted, half, space.step, space.near, space.far, bits, coarse, occupied.shape[0]
+        space.contracted, half, space.step, space.near, space.far, bits, distance, occupied.shape[0]
     )  # fmt: skip
 
 

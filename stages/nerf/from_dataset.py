@@ -15,7 +15,6 @@ import numpy as np
 from stages.nerf.config import FieldConfig, TrainingConfig
 from stages.nerf.datasets import Dataset, load_dataset
 from stages.nerf.field import Field
-from stages.nerf.loading import torch_device
 from stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
 from stages.nerf.raybank import View
 from stages.nerf.renderer import NumbaRenderer
@@ -25,8 +24,7 @@ if TYPE_CHECKING:
     from stages.nerf.datasets.assemble import Holdout
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), None: (0.5, 0.5, 0.5)}
-BOUNDED_STEPS = {"object": 384, "bounded": 448}
-CONTRACTED_STEP = 1 / 128
+BOUNDED_STEP, CONTRACTED_STEP = 2 / 256, 1 / 128
 CONTRACTED_FAR = 64.0
 REPORT_EVERY_S = 0.25
 VALIDATION_STRIDE = 41
@@ -61,7 +59,7 @@ def space_of(dataset: Dataset) -> Space:
     scale = float(half.max())
     share = tuple(float(v) for v in half / scale)
     near = max(0.25 * bounds.near / scale, 0.01)
-    return Space(False, centre, scale, half=share, near=near, far=64.0, step=2 / BOUNDED_STEPS[dataset.scene])  # type: ignore[arg-type]
+    return Space(False, centre, scale, half=share, near=near, far=64.0, step=BOUNDED_STEP)  # type: ignore[arg-type]
 
 
 def views_of(dataset: Dataset) -> list[View]:
@@ -112,7 +110,7 @@ def train_field(
     training, config = training or TrainingConfig(), config or FieldConfig()
     dataset = load_dataset(path, "train", size, holdout=holdout)
     views = views_of(dataset)
-    held_out = _held_out(path, size, holdout)
+    held_out = held_out_views(path, size, holdout)
     metadata = metadata_of(dataset, views, config)
     trainer = make_learner(views, metadata.space, config, training)
     monitor = _Monitor(trainer, metadata, held_out[: training.validation_views], report)
@@ -137,6 +135,7 @@ def make_learner(views: list[View], space: Space, config: FieldConfig, training:
     """Compiled kernels, or torch on the CPU or on CUDA. Raises ConfigError where there is no CUDA device."""
     if training.backend == "numba":
         return Trainer(views, space, config, training)
+    from stages.nerf.torch_renderer import torch_device
     from stages.nerf.torch_training import TorchTrainer
 
     return TorchTrainer(views, space, config, training, torch_device(training.backend))
@@ -147,7 +146,8 @@ def replace_metadata(metadata: FieldMetadata, **changes: object) -> FieldMetadat
     return msgspec.structs.replace(metadata, **changes)
 
 
-def _held_out(path: Path, size: int | None, holdout: Holdout | None) -> list[View]:
+def held_out_views(path: Path, size: int | None, holdout: Holdout | None) -> list[View]:
+    """The held-out images of a dataset, loaded; none where nothing is held out."""
     if holdout is None:
         return []
     both = load_dataset(path, "all", size, holdout=holdout)

@@ -5,14 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from stages.errors import ConfigError
 from stages.nerf.config import Backend
 from stages.nerf.field import Field, load_field
 from stages.nerf.renderer import NumbaRenderer
 from stages.nerf.rendering_api import RayRenderer
-from stages.nerf.torch_renderer import TorchRenderer
 
 
 def load_renderer(path: str | Path, threads: int = 1, backend: Backend = "numba") -> RayRenderer:
@@ -22,14 +19,12 @@ def load_renderer(path: str | Path, threads: int = 1, backend: Backend = "numba"
 
 def make_renderer(field: Field, threads: int = 1, backend: Backend = "numba") -> RayRenderer:
     """A renderer of a field in memory. Raises ConfigError where there is no CUDA device."""
-    return NumbaRenderer(field, threads) if backend == "numba" else TorchRenderer(field, torch_device(backend))
+    if backend == "numba":
+        return NumbaRenderer(field, threads)
+    # Torch takes 200 MB and seconds to import; a process that only renders on the CPU does without.
+    from stages.nerf.torch_renderer import TorchRenderer, torch_device
 
-
-def torch_device(backend: Backend) -> torch.device:
-    """The device of the torch backends. Raises ConfigError where there is no CUDA device."""
-    if backend == "cuda" and not torch.cuda.is_available():
-        raise ConfigError("backend cuda: torch finds no CUDA device here; use numba")
-    return torch.device("cuda" if backend == "cuda" else "cpu")
+    return TorchRenderer(field, torch_device(backend))
 
 
 def warm_up(renderer: RayRenderer, jacobian: bool = False) -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
-from stages.geometry.cameras import Camera, rays
+from stages.geometry import Camera, camera_centre
 from stages.nerf.metadata import Space
 from stages.nerf.rendering_api import RenderedRays, RenderedView
 
@@ -32,18 +34,42 @@ def by_object_rays(space: Space, jacobian: np.ndarray, unit: np.ndarray, length:
     return np.concatenate([jacobian[..., :3] / scale, by_direction], axis=-1)
 
 
-def tile_view(
-    render_rays: Callable[[np.ndarray, np.ndarray], RenderedRays], camera: Camera, cam_from_object: np.ndarray
-) -> RenderedView:
-    """Render a view tile by tile, so that rays traced together read the same table entries."""
+@dataclass(frozen=True)
+class ViewRays:
+    """A camera's rays tile by tile, so that rays traced together read the same table entries.
+
+    order: (n,) row-major pixel indices; unit: (n, 3) float32 unit directions in the camera; length: (n,) of those with
+    z = 1.
+    """
+
+    order: np.ndarray
+    unit: np.ndarray
+    length: np.ndarray
+
+
+@lru_cache(maxsize=2)
+def view_rays(camera: Camera) -> ViewRays:
+    """The rays through every pixel; the same for every pose."""
     order = tile_order(camera.width, camera.height)
-    origins, directions = rays(camera, cam_from_object, camera.grid()[order])
-    traced = render_rays(origins, directions)
+    directions = camera.directions(camera.grid()[order])
+    length = np.linalg.norm(directions, axis=1)
+    return ViewRays(order, directions / length[:, None], length)
+
+
+def tile_view(
+    trace: Callable[[np.ndarray, np.ndarray], RenderedRays], space: Space, camera: Camera, cam_from_object: np.ndarray
+) -> RenderedView:
+    """Render a view; `trace` takes origins and unit directions in the field's coordinates."""
+    bundle = view_rays(camera)
+    origin = (camera_centre(cam_from_object) - space.centre) / space.scale
+    origins = np.empty_like(bundle.unit)
+    origins[:] = origin
+    traced = trace(origins, bundle.unit @ cam_from_object[:3, :3].astype(np.float32))
     shape = (camera.height, camera.width)
     rgb, depth, opacity = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.float32)
-    rgb.reshape(-1, 3)[order] = (traced.rgb * 255 + 0.5).astype(np.uint8)
-    depth.reshape(-1)[order] = traced.depth
-    opacity.reshape(-1)[order] = traced.opacity
+    rgb.reshape(-1, 3)[bundle.order] = traced.rgb * np.float32(255) + np.float32(0.5)
+    depth.reshape(-1)[bundle.order] = traced.depth * (np.float32(space.scale) / bundle.length)
+    opacity.reshape(-1)[bundle.order] = traced.opacity
     return RenderedView(rgb, depth, opacity, camera, cam_from_object)
 
 

@@ -5,19 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from scipy.ndimage import distance_transform_cdt
 
 from stages.geometry.cameras import Camera
+from stages.nerf.kernels.density import raise_to
+from stages.nerf.kernels.space import BLOCK
 from stages.nerf.metadata import Space
-
-BLOCK = 8
 
 
 def pack(occupied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bits (one a cell, x fastest) and one byte a block of 8x8x8 cells, of an (n, n, n) bool grid [z, y, x]."""
+    """Bits (one a cell, x fastest) of an (n, n, n) bool grid [z, y, x], and distances in blocks of 4x4x4 cells.
+
+    A block's distance is the largest difference of an index to that of the nearest occupied block, at most 255.
+    """
     n = occupied.shape[0]
     m = n // BLOCK
     blocks = occupied.reshape(m, BLOCK, m, BLOCK, m, BLOCK).any(axis=(1, 3, 5))
-    return np.packbits(occupied.ravel(), bitorder="little"), blocks.ravel().astype(np.uint8)
+    distance = distance_transform_cdt(~blocks, metric="chessboard") if blocks.any() else np.full(blocks.shape, m)
+    return np.packbits(occupied.ravel(), bitorder="little"), np.minimum(distance, 255).ravel().astype(np.uint8)
 
 
 def cell_positions(cells: np.ndarray, n: int, inside: np.ndarray) -> np.ndarray:
@@ -94,10 +99,10 @@ class OccupancyEstimate:
             cells = np.concatenate([self._some(self.candidates, count), self._some(among, min(count, len(among)))])
         u = cell_positions(cells, self.n, self.rng.random((len(cells), 3), dtype=np.float32))
         self.estimate *= decay
-        np.maximum.at(self.estimate, cells, densities(u))
-        opacity = self.estimate * self.space.step
-        limit = min(least, float(opacity[self.candidates].mean()))
-        self.occupied = ((opacity > limit) & self.allowed).reshape(self.n, self.n, self.n)
+        raise_to(self.estimate, cells, densities(u))
+        mean = float(self.estimate.sum(dtype=np.float64)) / len(self.candidates)
+        limit = min(least / self.space.step, mean)
+        self.occupied = (self.estimate > limit).reshape(self.n, self.n, self.n)
 
     def _some(self, cells: np.ndarray, count: int) -> np.ndarray:
         """Random ones, some of them perhaps twice: drawing without repeats would sort millions of cells."""

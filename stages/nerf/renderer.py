@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from stages.geometry.cameras import Camera
 from stages.nerf.field import Field
 from stages.nerf.kernels.jacobian import render_jacobian
 from stages.nerf.kernels.render import render
+from stages.nerf.kernels.types import Net
+from stages.nerf.kernels.vectors import WIDTH, reads_half_floats
 from stages.nerf.metadata import FieldMetadata
 from stages.nerf.normalise import by_object_rays, normalised, tile_view
 from stages.nerf.rendering_api import RenderedRays, RenderedView
@@ -28,7 +32,7 @@ class NumbaRenderer:
         self.metadata: FieldMetadata = field.metadata
         self.stop_below = stop_below
         self.samples_evaluated = 0
-        self._net, self._domain = field.net, field.domain()
+        self._net, self._domain = _packed(field.net), field.domain()
         self._background = np.array(field.metadata.background, np.float32)
         self._workers = Workers(field.metadata.config, threads, PACKET, PACKET * PER_RAY, backward=False)
         self._jacobian_workers: Workers | None = None
@@ -36,19 +40,23 @@ class NumbaRenderer:
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
         """See RayRenderer."""
         o, d, length = normalised(self.metadata.space, origins, directions)
+        traced = self._trace(o, d)
+        return replace(traced, depth=traced.depth / length)
+
+    def _trace(self, o: np.ndarray, d: np.ndarray) -> RenderedRays:
         n = len(o)
         rgb, depth, opacity = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
         jitter = np.full(n, 0.5, np.float32)
         evaluated = self._workers.each(
             n,
-            CHUNK,
+            int(np.clip(n // (4 * self._workers.threads), PACKET, CHUNK)),
             lambda s, a, b: render(
                 self._net, self._domain, o, d, jitter, self._background, a, b,
                 PER_RAY, self.stop_below, s.samples, s.rays, rgb, depth, opacity,
             ),
         )  # fmt: skip
         self.samples_evaluated += sum(evaluated)  # type: ignore[arg-type]
-        return RenderedRays(np.clip(rgb, 0, 1), depth / length, opacity)
+        return RenderedRays(np.clip(rgb, 0, 1, out=rgb), depth, opacity)
 
     def render_rays_jacobian(
         self, origins: np.ndarray, directions: np.ndarray, channel_weights: np.ndarray
@@ -76,10 +84,17 @@ class NumbaRenderer:
 
     def render_view(self, camera: Camera, cam_from_object: np.ndarray) -> RenderedView:
         """See RayRenderer."""
-        return tile_view(self.render_rays, camera, cam_from_object)
+        return tile_view(self._trace, self.metadata.space, camera, cam_from_object)
 
     def close(self) -> None:
         """End the threads."""
         self._workers.close()
         if self._jacobian_workers is not None:
             self._jacobian_workers.close()
+
+
+def _packed(net: Net) -> Net:
+    """The table in half precision, as the field's file has it, where the kernels can read that: half the memory."""
+    if net.table.shape[1] != WIDTH or not reads_half_floats():
+        return net
+    return net._replace(table=net.table.astype(np.float16).view(np.uint16))

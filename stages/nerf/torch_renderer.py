@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
+from stages.errors import ConfigError
 from stages.geometry.cameras import Camera
+from stages.nerf.config import Backend
 from stages.nerf.field import Field
 from stages.nerf.normalise import by_object_rays, normalised, tile_view
 from stages.nerf.rendering_api import RenderedRays, RenderedView
@@ -24,6 +28,10 @@ class TorchRenderer:
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
         """See RayRenderer."""
         o, d, length = normalised(self.metadata.space, origins, directions)
+        traced = self._trace_all(o, d)
+        return replace(traced, depth=traced.depth / length)
+
+    def _trace_all(self, o: np.ndarray, d: np.ndarray) -> RenderedRays:
         parts = []
         with torch.inference_mode():
             for start in range(0, len(o), CHUNK):
@@ -32,7 +40,7 @@ class TorchRenderer:
         if not parts:
             return RenderedRays(np.empty((0, 3), np.float32), np.empty(0, np.float32), np.empty(0, np.float32))
         rgb, depth, opacity = (np.concatenate(column) for column in zip(*parts, strict=True))
-        return RenderedRays(np.clip(rgb, 0, 1), depth / length, opacity)
+        return RenderedRays(np.clip(rgb, 0, 1), depth, opacity)
 
     def render_rays_jacobian(
         self, origins: np.ndarray, directions: np.ndarray, channel_weights: np.ndarray
@@ -52,7 +60,7 @@ class TorchRenderer:
 
     def render_view(self, camera: Camera, cam_from_object: np.ndarray) -> RenderedView:
         """See RayRenderer."""
-        return tile_view(self.render_rays, camera, cam_from_object)
+        return tile_view(self._trace_all, self.metadata.space, camera, cam_from_object)
 
     def _trace(self, o: torch.Tensor, d: torch.Tensor) -> TwinRays:
         jitter = torch.full((len(o),), 0.5, device=o.device)
@@ -63,3 +71,10 @@ class TorchRenderer:
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(array, device=self._twin.device)
+
+
+def torch_device(backend: Backend) -> torch.device:
+    """The device of the torch backends. Raises ConfigError where there is no CUDA device."""
+    if backend == "cuda" and not torch.cuda.is_available():
+        raise ConfigError("backend cuda: torch finds no CUDA device here; use numba")
+    return torch.device("cuda" if backend == "cuda" else "cpu")

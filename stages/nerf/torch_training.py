@@ -56,7 +56,7 @@ class TorchTrainer(Learner):
             samples = self._twin.march(origins, directions, self._tensor(jitter))
         rays = self._twin(origins, directions, background, samples)
         loss = huber_loss(rays.rgb, target, reduction="sum", delta=self.config.huber_delta)
-        loss = loss + self.config.distortion * distortion_loss(samples, rays.weights, self.space.contracted)
+        loss = loss + self.distortion * distortion_loss(samples, rays.weights, self.space.contracted)
         self._adam.zero_grad()
         (loss / len(jitter)).backward()
         self._adam.step()

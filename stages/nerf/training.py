@@ -24,14 +24,15 @@ from stages.nerf.raybank import Batch, RayBank, View
 from stages.nerf.renderer import NumbaRenderer
 from stages.nerf.workers import Workers
 
-PACKET = 32
+PACKET, PACKET_ROWS = 128, 768
 ROWS = 16384
 PER_RAY = 8
 STOP_BELOW = 1e-3
 CHUNK = 512
-OCCUPANCY_EVERY = 16
 OFTEN, SETTLED = 256, 1024
+OCCUPANCY_EVERY = (16, 32, 64)
 FREE_SHARE = 0.2
+DISTORTION = {False: 1e-2, True: 5e-2}
 FIRST_RAYS, RAYS = 512, (256, 1 << 15)
 
 
@@ -52,6 +53,7 @@ class Learner(ABC):
 
     def __init__(self, views: list[View], space: Space, field: FieldConfig, config: TrainingConfig):
         self.config, self.space = config, space
+        self.distortion = DISTORTION[space.contracted] if config.distortion is None else config.distortion
         self._rng = np.random.default_rng(config.seed)
         n = field.occupancy_resolution
         seen = seen_by_cameras(space, n, [(v.camera, v.cam_from_object) for v in views])
@@ -82,7 +84,7 @@ class Learner(ABC):
 
     def step(self, fraction: float) -> float:
         """One batch at a `fraction` 0..1 of the schedule; returns its mean squared error."""
-        if self.steps % (OCCUPANCY_EVERY if self.steps < SETTLED else 4 * OCCUPANCY_EVERY) == 0:
+        if self.steps % OCCUPANCY_EVERY[(self.steps >= OFTEN) + (self.steps >= SETTLED)] == 0:
             self.look_again()
         rate = self.config.learning_rate * (self.config.final_learning_rate / self.config.learning_rate) ** fraction
         batch = self._bank.draw(self._rng, self._rays)
@@ -163,12 +165,14 @@ class Trainer(Learner):
 
     def _gradients(self, batch: Batch, jitter: np.ndarray) -> list[tuple[float, int]]:
         n = len(jitter)
-        delta, spread = np.float32(self.config.huber_delta), np.float32(self.config.distortion)
+        # As many rays as fill the second-level cache with what the backward pass needs of their samples.
+        packet = int(np.clip(PACKET_ROWS * n / self.config.samples_per_step, 4, PACKET))
+        delta, spread = np.float32(self.config.huber_delta), np.float32(self.distortion)
         return self._workers.split(
             n,
             lambda s, a, b: train(
                 self._net, self._domain, batch.origins, batch.directions, jitter, batch.background, batch.target,
-                a, b, PER_RAY, STOP_BELOW, delta, spread, np.float32(1 / max(n, 1)),
+                a, b, packet, PER_RAY, STOP_BELOW, delta, spread, np.float32(1 / max(n, 1)),
                 s.samples, s.rays, self._optimiser.gradients[s.index],
             ),
         )  # type: ignore[return-value]  # fmt: skip

@@ -13,7 +13,9 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from stages.nerf.config import FieldConfig
+from stages.nerf.kernels.encoding import LANES
 from stages.nerf.kernels.types import SH_SIZE, Rays, Samples
+from stages.nerf.kernels.vectors import BLOCK
 
 
 def new_samples(config: FieldConfig, rows: int, backward: bool) -> Samples:
@@ -26,7 +28,7 @@ def new_samples(config: FieldConfig, rows: int, backward: bool) -> Samples:
     gradient_rows = rows if backward else 0
     return Samples(
         y=array(rows, 3),
-        u=array(rows, 3),
+        u=array(3, rows + LANES),
         t=array(rows),
         dt=array(rows),
         ray=np.zeros(rows, np.int32),
@@ -39,6 +41,8 @@ def new_samples(config: FieldConfig, rows: int, backward: bool) -> Samples:
         dx=array(gradient_rows, inputs),
         dh=array(gradient_rows, config.hidden),
         dout=array(gradient_rows, outputs),
+        corner_rows=np.zeros(8 * BLOCK, np.uint32),
+        corner_weights=array(8 * BLOCK),
     )
 
 

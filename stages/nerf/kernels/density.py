@@ -15,7 +15,14 @@ def densities(net: Net, u: np.ndarray, first: int, last: int, samples: Samples, 
     size = min(samples.t.shape[0], 256)
     for start in range(first, last, size):
         count = min(size, last - start)
-        samples.u[:count] = u[start : start + count]
+        samples.u[:, :count] = u[start : start + count].T
         density_network(net, samples, 0, count)
         for s in range(count):
             out[start + s] = density(samples.out[s, 0])
+
+
+@njit(nogil=True, cache=True)
+def raise_to(estimate: np.ndarray, cells: np.ndarray, values: np.ndarray) -> None:
+    """estimate[cells] = max(estimate[cells], values), also where a cell comes twice."""
+    for i in range(cells.shape[0]):
+        estimate[cells[i]] = max(estimate[cells[i]], values[i])

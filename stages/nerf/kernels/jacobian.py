@@ -12,7 +12,7 @@ from stages.nerf.kernels.backward import (
     density_backward,
     shade_backward,
 )
-from stages.nerf.kernels.encoding import position_gradient
+from stages.nerf.kernels.encoding import position_gradients
 from stages.nerf.kernels.packet import forward, shade, surface
 from stages.nerf.kernels.space import cube_gradient
 from stages.nerf.kernels.types import FASTMATH, SH_SIZE, Domain, Net, Rays, Samples
@@ -52,17 +52,18 @@ def ray_gradients(
     rows: int,
     samples: Samples,
     rays: Rays,
+    du: np.ndarray,
     jacobian: np.ndarray,
     k: int,
 ) -> None:
     """Add up the samples' gradients into jacobian[start:start + count, k]: origin, then unit direction."""
-    du, dy = np.empty(3, np.float32), np.empty(3, np.float32)
+    dy = np.empty(3, np.float32)
     features = rays.feats.shape[1] - SH_SIZE
     for r in range(count):
         harmonics_gradient(directions[start + r], rays.dfeats[r], features, jacobian[start + r, k, 3:])
+    position_gradients(net, samples, 0, rows, du)
     for s in range(rows):
-        position_gradient(net, samples.u, samples.dx, s, du)
-        cube_gradient(contracted, samples.y[s], du, dy)
+        cube_gradient(contracted, samples.y[s], du[:, s], dy)
         r = start + samples.ray[s]
         for a in range(3):
             jacobian[r, k, a] += dy[a]
@@ -95,6 +96,7 @@ def render_jacobian(
     """
     size = rays.t.shape[0]
     drgb = np.empty((size, 3), np.float32)
+    du = np.empty((3, samples.t.shape[0]), np.float32)
     for start in range(first, last, size):
         count = min(size, last - start)
         rows, _ = forward(
@@ -115,4 +117,4 @@ def render_jacobian(
             composite_backward(samples, rays, count, 0.0, dom.contracted)
             if rows > 0:
                 density_backward(net, samples, rows)
-            ray_gradients(net, dom.contracted, directions, start, count, rows, samples, rays, jacobian, k)
+            ray_gradients(net, dom.contracted, directions, start, count, rows, samples, rays, du, jacobian, k)

@@ -7,8 +7,10 @@ import math
 import numpy as np
 from numba import njit
 
-from stages.nerf.kernels.space import clip, occupied, skip, to_cube
+from stages.nerf.kernels.space import BLOCK, clip, occupied, skip, to_cube
 from stages.nerf.kernels.types import FASTMATH, Domain, Rays, Samples
+
+TINY, HUGE = np.float32(1e-9), np.float32(1e9)
 
 
 @njit(nogil=True, fastmath=FASTMATH)
@@ -30,6 +32,12 @@ def begin(
         rays.feats[r, :] = 0
 
 
+@njit(inline="always")
+def inverse(component: float) -> float:
+    """1 / component, large where the ray does not move along the axis."""
+    return np.float32(1) / component if abs(component) > TINY else HUGE
+
+
 @njit(nogil=True, fastmath=FASTMATH)
 def advance(
     dom: Domain,
@@ -46,22 +54,25 @@ def advance(
 
     Samples of a ray lie on t0 + i * step whatever was skipped, so that every way to skip gives the same samples.
     """
-    n = dom.resolution
+    n, m = np.float32(dom.resolution), np.float32(dom.resolution // BLOCK)
+    step = np.float32(dom.step)
     capacity = samples.t.shape[0]
     for r in range(count):
         if not rays.alive[r]:
             continue
-        o, d = origins[first + r], directions[first + r]
+        o0, o1, o2 = origins[first + r, 0], origins[first + r, 1], origins[first + r, 2]
+        d0, d1, d2 = directions[first + r, 0], directions[first + r, 1], directions[first + r, 2]
+        i0, i1, i2 = inverse(d0), inverse(d1), inverse(d2)
         t, far = rays.t[r], rays.far[r]
         taken = 0
         while taken < per_ray and t < far and row < capacity:
-            y0, y1, y2 = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
+            y0, y1, y2 = o0 + t * d0, o1 + t * d1, o2 + t * d2
             u0, u1, u2, grow = to_cube(dom.contracted, y0, y1, y2)
-            dt = np.float32(dom.step) * grow
-            state = occupied(dom, u0, u1, u2)
-            if state == 2:
+            dt = step * grow
+            empty = occupied(dom, u0, u1, u2)
+            if empty < 0:
                 samples.y[row, 0], samples.y[row, 1], samples.y[row, 2] = y0, y1, y2
-                samples.u[row, 0], samples.u[row, 1], samples.u[row, 2] = u0, u1, u2
+                samples.u[0, row], samples.u[1, row], samples.u[2, row] = u0, u1, u2
                 samples.t[row], samples.dt[row] = t, dt
                 samples.ray[row], samples.previous[row] = r, rays.last[r]
                 rays.last[r] = row
@@ -69,10 +80,18 @@ def advance(
                 taken += 1
                 t += dt
             elif dom.contracted:
+                # Along a ray of unit speed no coordinate of the cube changes faster than by 1/4.
+                free = t + np.float32(empty - 1) * np.float32(4) / m
                 t += dt
+                while t < free and t < far:
+                    y0, y1, y2 = o0 + t * d0, o1 + t * d1, o2 + t * d2
+                    t += step * max(np.float32(1), np.float32(math.sqrt(y0 * y0 + y1 * y1 + y2 * y2)))
             else:
-                ahead = skip(n >> 3 if state == 0 else n, u0, u1, u2, d)
-                t += dt * max(np.float32(1), np.float32(math.ceil(ahead / dt)))
+                if empty == 0:
+                    ahead = skip(n, np.float32(0), u0, u1, u2, i0, i1, i2)
+                else:
+                    ahead = skip(m, np.float32(empty - 1), u0, u1, u2, i0, i1, i2)
+                t += dt * max(np.float32(1), np.ceil(ahead / dt))
         rays.t[r] = t
         if t >= far or taken < per_ray:
             rays.alive[r] = False

@@ -9,6 +9,9 @@ from numba import njit
 
 from stages.nerf.kernels.types import FASTMATH, Domain
 
+BLOCK = 4
+"""Cells along each side of a block."""
+
 
 @njit(inline="always")
 def to_cube(contracted: bool, y0: float, y1: float, y2: float) -> tuple[float, float, float, float]:
@@ -51,16 +54,17 @@ def cube_gradient(contracted: bool, y: np.ndarray, du: np.ndarray, dy: np.ndarra
 
 @njit(inline="always")
 def occupied(dom: Domain, u0: float, u1: float, u2: float) -> int:
-    """0 where the block of the position is empty, 1 where only its cell is, 2 where the cell is occupied."""
-    n = dom.resolution
-    ix = min(max(int(u0 * n), 0), n - 1)
-    iy = min(max(int(u1 * n), 0), n - 1)
-    iz = min(max(int(u2 * n), 0), n - 1)
-    m = n >> 3
-    if dom.coarse[(ix >> 3) + m * ((iy >> 3) + m * (iz >> 3))] == 0:
-        return 0
-    flat = ix + n * (iy + n * iz)
-    return 2 if (dom.bits[flat >> 3] >> (flat & 7)) & 1 else 1
+    """-1 where the cell is occupied, else how many blocks away the nearest block with an occupied cell is."""
+    n = np.int32(dom.resolution)
+    ix = min(max(np.int32(u0 * n), np.int32(0)), n - np.int32(1))
+    iy = min(max(np.int32(u1 * n), np.int32(0)), n - np.int32(1))
+    iz = min(max(np.int32(u2 * n), np.int32(0)), n - np.int32(1))
+    m = n // BLOCK
+    distance = dom.distance[np.uint64((ix // BLOCK) + m * ((iy // BLOCK) + m * (iz // BLOCK)))]
+    if distance > 0:
+        return np.int64(distance)
+    flat = np.uint64(ix + n * (iy + n * iz))
+    return -1 if (dom.bits[flat >> np.uint64(3)] >> (flat & np.uint64(7))) & 1 else 0
 
 
 @njit(inline="always")
@@ -82,13 +86,17 @@ def clip(dom: Domain, o: np.ndarray, d: np.ndarray) -> tuple[float, float]:
 
 
 @njit(inline="always")
-def skip(n: int, u0: float, u1: float, u2: float, d: np.ndarray) -> float:
-    """Distance to the border of the cell (of n along an axis) that the position lies in; uncontracted space."""
-    best = np.float32(1e9)
-    for a in range(3):
-        u = u0 if a == 0 else (u1 if a == 1 else u2)
-        if abs(d[a]) > np.float32(1e-9):
-            index = math.floor(u * n)
-            border = (index + 1 if d[a] > 0 else index) / n
-            best = min(best, np.float32((border - u) * 2 / d[a]))
-    return max(best, np.float32(0))
+def leave(u: float, inverse: float, n: float, reach: float) -> float:
+    """Distance along the ray at which a coordinate leaves its cell (of n along the axis) and `reach` cells around it.
+
+    `inverse` is 1 / direction, infinite where the ray does not move along the axis; uncontracted space.
+    """
+    index = np.floor(u * n)
+    border = (index + np.float32(1) + reach if inverse > 0 else index - reach) / n
+    return (border - u) * np.float32(2) * inverse
+
+
+@njit(inline="always")
+def skip(n: float, reach: float, u0: float, u1: float, u2: float, i0: float, i1: float, i2: float) -> float:
+    """Distance along the ray to the border of the position's cell and `reach` cells around it."""
+    return max(min(leave(u0, i0, n, reach), leave(u1, i1, n, reach), leave(u2, i2, n, reach)), np.float32(0))

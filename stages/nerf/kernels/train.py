@@ -39,7 +39,7 @@ def accumulate(net: Net, samples: Samples, rays: Rays, rows: int, count: int, gr
     if rows > 0:
         grads.w2[:] += np.dot(samples.h[:rows].T, samples.dout[:rows])
         grads.w1[:] += np.dot(samples.x[:rows].T, samples.dh[:rows])
-        scatter(net, samples.u, samples.dx, 0, rows, grads.table)
+        scatter(net, samples, 0, rows, grads.table)
 
 
 @njit(nogil=True, fastmath=FASTMATH, cache=True)
@@ -53,6 +53,7 @@ def train(
     target: np.ndarray,
     first: int,
     last: int,
+    packet: int,
     per_ray: int,
     stop_below: float,
     huber_delta: float,
@@ -64,10 +65,10 @@ def train(
 ) -> tuple[float, int]:
     """Add the gradients of rays first..last; return their summed squared error and the samples evaluated.
 
-    The loss is Huber's of the colour against `target` (n, 3), already over the ray's `background` (n, 3), times
-    `scale`, plus the distortion loss.
+    `packet` rays are traced together, at most as many as `rays` has room for. The loss is Huber's of the colour
+    against `target` (n, 3), already over the ray's `background` (n, 3), times `scale`, plus the distortion loss.
     """
-    size = rays.t.shape[0]
+    size = min(packet, rays.t.shape[0])
     drgb = np.empty((size, 3), np.float32)
     squared, total = 0.0, 0
     for start in range(first, last, size):

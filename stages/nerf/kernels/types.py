@@ -15,7 +15,7 @@ SH_SIZE = 16
 class Net(NamedTuple):
     """Learnt parameters (float32) and the layout of the hash grid (int64, one entry a level)."""
 
-    table: np.ndarray  # (entries, level_features)
+    table: np.ndarray  # (entries, level_features); float32, or the bits of float16 for rendering
     w1: np.ndarray  # (levels * level_features, hidden)
     w2: np.ndarray  # (hidden, 1 + features)
     c1: np.ndarray  # (features + SH_SIZE, colour_hidden)
@@ -35,7 +35,7 @@ class Domain(NamedTuple):
     near: float
     far: float
     bits: np.ndarray  # occupancy, one bit a cell, x fastest
-    coarse: np.ndarray  # one byte for each block of 8 x 8 x 8 cells
+    distance: np.ndarray  # for each block of 4 x 4 x 4 cells, how many blocks away the nearest occupied one is
     resolution: int
 
 
@@ -43,7 +43,7 @@ class Samples(NamedTuple):
     """Everything about the samples of a packet of rays; rows are in order of evaluation."""
 
     y: np.ndarray  # (n, 3) position, normalised coordinates
-    u: np.ndarray  # (n, 3) position in the unit cube of the grid
+    u: np.ndarray  # (3, n and a vector) position in the unit cube of the grid
     t: np.ndarray  # (n,) distance along the ray
     dt: np.ndarray  # (n,)
     ray: np.ndarray  # (n,) index in the packet
@@ -56,6 +56,8 @@ class Samples(NamedTuple):
     dx: np.ndarray  # (n, levels * level_features) gradients, same shapes
     dh: np.ndarray
     dout: np.ndarray
+    corner_rows: np.ndarray  # scratch of encoding.plan
+    corner_weights: np.ndarray
 
 
 class Rays(NamedTuple):

@@ -112,7 +112,7 @@ def test_training_gradients_as_the_twin(space: Space, name: str) -> None:
     delta, distortion, scale = 0.1, 0.02, 1 / 48
     scratch = workers.scratch[0]
     squared, _ = train(
-        field.net, field.domain(), origins, directions, jitter, background, target, 0, 48, 8, 0.0,
+        field.net, field.domain(), origins, directions, jitter, background, target, 0, 48, 20, 8, 0.0,
         np.float32(delta), np.float32(distortion), np.float32(scale), scratch.samples, scratch.rays, grads,
     )  # fmt: skip
     twin = twin_of(field)
@@ -136,4 +136,13 @@ def test_the_packed_domain_keeps_every_occupied_cell() -> None:
     flat = x + 16 * (y + 16 * z)
     assert np.all(domain.bits[flat >> 3] >> (flat & 7) & 1)
     assert int(np.unpackbits(domain.bits).sum()) == occupied.sum()
-    assert np.all(domain.coarse[(x // 8) + 2 * ((y // 8) + 2 * (z // 8))] == 1)
+
+
+def test_block_distances_are_those_to_the_nearest_occupied_block() -> None:
+    occupied = np.random.default_rng(0).random((32, 32, 32)) < 5e-5
+    distance = domain_of(BOX, occupied).distance.reshape(8, 8, 8)
+    blocks = np.argwhere(occupied.reshape(8, 4, 8, 4, 8, 4).any(axis=(1, 3, 5)))
+    everywhere = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1)
+    expected = np.abs(everywhere[..., None, :] - blocks).max(axis=-1).min(axis=-1)
+    np.testing.assert_array_equal(distance, expected)
+    assert domain_of(BOX, np.zeros((32, 32, 32), bool)).distance.min() == 8

@@ -16,10 +16,11 @@ from stages.geometry import Camera, look_at, rays
 from stages.nerf import from_dataset
 from stages.nerf.config import FieldConfig, TrainingConfig
 from stages.nerf.field import load_field
-from stages.nerf.loading import load_renderer, torch_device
+from stages.nerf.loading import load_renderer
 from stages.nerf.metadata import FieldMetadata, Space
 from stages.nerf.raybank import View
 from stages.nerf.renderer import NumbaRenderer
+from stages.nerf.torch_renderer import torch_device
 from stages.nerf.torch_training import TorchTrainer
 from stages.nerf.training import Trainer, evaluate
 

@@ -1,0 +1,196 @@
+"""How fast the parts are on this machine."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any
+
+import tyro
+from rich.table import Table
+
+import deploy
+from deploy.errors import UsageError
+from deploy.output import check_writable, progress_console, result_console, write_json
+from deploy.scene import demo_file
+from stages.nerf.config import FieldConfig
+
+_ROOT = Path(deploy.__file__).resolve().parent.parent
+_DATA = _ROOT.parent / "shared" / "data"
+_SIZES = {"lego": 400, "demo": 400, "fern": 504, "fox": 480}
+
+
+@dataclass(frozen=True)
+class Render:
+    """A view at several sizes: time, samples, loss against an exhaustive render, share of what the machine can do.
+
+    Example: fieldpose bench render --json out/bench/render.json
+
+    The JSON file has: machine, field, limits, rss_mb, sizes (pixels of the longer side -> ms_per_view,
+    twin_ms_per_view, speedup, psnr_loss_db, samples, samples_per_s, fraction_of_limit and more), steps, tables, rays.
+    """
+
+    dataset: Path | None = None
+    """Posed images with a held-out split; ../shared/data/lego where it exists, else the demo scene."""
+    field: Path | None = None
+    """A field of them; one is trained and kept in the output folder where none is given."""
+    sizes: tuple[int, ...] = (200, 320, 400, 800)
+    """Pixels of the longer side."""
+    views: int = 3
+    """Views of each size; one of those above 400 pixels, since the twin takes a minute there."""
+    minutes: float = 5.0
+    """Time to train for."""
+    out: Path = Path("out/bench")
+    """Folder of the field and of the plot, render.png."""
+    json: Path | None = None
+
+    def run(self) -> int:
+        """Measure, print, plot."""
+        check_writable(self.json)
+        render = _benchmark("render")
+        dataset = self.dataset or _first_dataset()
+        with progress_console().status("training the field") as status:
+            path = render.field_of(self.field, dataset, 400, self.minutes, self.out)
+            figures = render.measure(path, dataset, self.sizes, self.views, _into(status.update, "bench render"))
+        render.plot(figures, self.out / "render.png")
+        write_json(self.json, figures)
+        _print_render(figures)
+        print(f"written: {self.out / 'render.png'}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Train:
+    """Training: samples a second against the plain twin, and the quality on held-out views over time.
+
+    Example: fieldpose bench train --json out/bench/train.json
+
+    The JSON file has: machine, samples_per_s, twin_samples_per_s, speedup, rss_mb, psnr_db (dataset -> seconds -> dB),
+    depth_error (dataset with true depth -> median, p90: shares of the depth, within the object).
+    """
+
+    datasets: tuple[Path, ...] = ()
+    """Posed images; by default lego, fern and fox in ../shared/data, where they exist, and the demo scene."""
+    minutes: float = 5.0
+    """Time to train for on each."""
+    twin_steps: int = 60
+    """Training steps over which the two are compared."""
+    out: Path = Path("out/bench")
+    """Folder of the plot, train.png."""
+    json: Path | None = None
+    model: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+
+    def run(self) -> int:
+        """Measure, print, plot."""
+        check_writable(self.json)
+        train = _benchmark("train")
+        datasets = [(path, _SIZES.get(path.resolve().name, 400)) for path in self.datasets or _all_datasets()]
+        with progress_console().status("bench train") as status:
+            report = _into(status.update, "bench train")
+            figures = train.measure(datasets, self.model, self.minutes, self.twin_steps, report)
+        train.plot(figures, self.out / "train.png")
+        write_json(self.json, figures)
+        _print_train(figures)
+        print(f"written: {self.out / 'train.png'}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Options:
+    """Measure how fast the parts are on this machine; run it while nothing else runs.
+
+    Example: fieldpose bench render
+    """
+
+    what: tyro.conf.OmitSubcommandPrefixes[
+        Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Train, tyro.conf.subcommand("train")]
+    ]
+
+    def run(self) -> int:
+        """Run the benchmark that was asked for."""
+        return self.what.run()
+
+
+def _benchmark(name: str) -> ModuleType:
+    """A module of tests/benchmark, which is part of the repository but not of an installed package."""
+    if not (_ROOT / "tests" / "benchmark").is_dir():
+        raise UsageError("the benchmarks are part of the repository: clone it, and `make install` there")
+    if str(_ROOT) not in sys.path:
+        sys.path.append(str(_ROOT))
+    return importlib.import_module(f"tests.benchmark.{name}")
+
+
+def _all_datasets() -> list[Path]:
+    found = {name: _DATA / name for name in ("lego", "fern", "fox") if (_DATA / name).is_dir()}
+    return [*found.values(), demo_file("transforms_train.json").parent]
+
+
+def _first_dataset() -> Path:
+    return _all_datasets()[0]
+
+
+def _into(update: Callable[[str], None], title: str) -> Callable[[str], None]:
+    return lambda text: update(f"{title}: {text}")
+
+
+def _print_render(figures: dict[str, Any]) -> None:
+    console = result_console()
+    table = Table(title=f"a view of {figures['field']['file']}", title_justify="left")
+    names = ("pixels", "ms", "twin, ms", "times faster", "loss, dB", "samples", "M samples/s", "of the limit")
+    for name in names:
+        table.add_column(name, justify="right")
+    for size, row in figures["sizes"].items():
+        table.add_row(
+            size,
+            f"{row['ms_per_view']:.1f}",
+            f"{row['twin_ms_per_view']:.0f}",
+            f"{row['speedup']:.0f}",
+            f"{row['psnr_loss_db']:.2f}",
+            f"{row['samples']:.0f}",
+            f"{row['samples_per_s'] / 1e6:.1f}",
+            f"{row['fraction_of_limit']:.0%}",
+        )
+    console.print(table)
+    limits = figures["limits"]
+    console.print(
+        f"{figures['machine']}: {2 * limits['multiply_adds_per_s'] / 1e9:.0f} GFLOP/s in small matrix products, "
+        f"{limits['reads_per_s'] / 1e6:.0f} M random reads/s; highest memory of a rendering process "
+        f"{figures['rss_mb']:.0f} MB",
+        highlight=False,
+    )
+    rays, many = figures["rays"], figures["rays"]["scattered_samples_per_s"] / 1e6
+    console.print(f"{rays['scattered']} scattered rays: {many:.1f} M samples/s", highlight=False)
+    console.print(
+        f"colours and derivatives of 512 rays, 40 times: {rays['refinement_ms']:.0f} ms; "
+        f"two views: {rays['two_views_ms']:.0f} ms",
+        highlight=False,
+    )
+
+
+def _print_train(figures: dict[str, Any]) -> None:
+    console = result_console()
+    seconds = sorted({float(s) for scores in figures["psnr_db"].values() for s in scores})
+    console.print("PSNR on held-out views (dB) after so many seconds of training:")
+    table = Table()
+    table.add_column("dataset")
+    for second in seconds:
+        table.add_column(f"{second:g}", justify="right")
+    for name, scores in figures["psnr_db"].items():
+        table.add_row(name, *(f"{scores[f'{s:g}']:.2f}" if f"{s:g}" in scores else "" for s in seconds))
+    console.print(table)
+    console.print(
+        f"{figures['machine']}: {figures['samples_per_s'] / 1e6:.2f} M samples/s, the plain twin "
+        f"{figures['twin_samples_per_s'] / 1e6:.3f} M, {figures['speedup']:.1f} times faster; highest memory "
+        f"{figures['rss_mb']:.0f} MB",
+        highlight=False,
+    )
+    for name, error in figures["depth_error"].items():
+        console.print(
+            f"{name}: error of depth within the object {error['median']:.2%} (median), {error['p90']:.2%} (90 %)",
+            highlight=False,
+        )

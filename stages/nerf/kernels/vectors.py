@@ -1,0 +1,123 @@
+"""Four features at a time: a table row is one vector register, which the compiler does not find by itself.
+
+Tables are float32, or the bits of float16 as uint16, which are read as such and computed with as float32.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from llvmlite import binding, ir
+from numba import types
+from numba.extending import intrinsic
+
+WIDTH = 4
+BLOCK = 64
+"""Samples that a plan is made for at once; see `encoding.plan`."""
+
+_F32, _I32, _I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+_V4 = ir.VectorType(_F32, WIDTH)
+_FLAGS = ("contract",)
+
+
+def reads_half_floats() -> bool:
+    """Whether this processor turns float16 into float32 by itself."""
+    return binding.get_host_cpu_features().get("f16c", True)
+
+
+def _data(context: Any, builder: ir.IRBuilder, kind: types.Array, array: ir.Value) -> ir.Value:
+    return context.make_array(kind)(context, builder, array).data
+
+
+def _row(builder: ir.IRBuilder, kind: types.Array, data: ir.Value, row: ir.Value) -> ir.Value:
+    """Row `row` of a table (n, 4) as four float32."""
+    half = kind.dtype == types.uint16
+    element = ir.VectorType(ir.HalfType() if half else _F32, WIDTH)
+    loaded = builder.load(builder.gep(builder.bitcast(data, element.as_pointer()), [row]))
+    loaded.align = 2 if half else 4
+    return builder.fpext(loaded, _V4) if half else loaded
+
+
+def _four(builder: ir.IRBuilder, data: ir.Value, at: ir.Value) -> ir.Value:
+    """Pointer to four float32 from data[at] on."""
+    return builder.bitcast(builder.gep(data, [at]), _V4.as_pointer())
+
+
+def _load(builder: ir.IRBuilder, pointer: ir.Value) -> ir.Value:
+    value = builder.load(pointer)
+    value.align = 4
+    return value
+
+
+def _store(builder: ir.IRBuilder, value: ir.Value, pointer: ir.Value) -> None:
+    builder.store(value, pointer).align = 4
+
+
+def _planned(builder: ir.IRBuilder, rows: ir.Value, weights: ir.Value, s: ir.Value, corner: int) -> tuple[Any, Any]:
+    """Table row and weight (in all four lanes) of a corner of sample s of the block."""
+    at = builder.add(s, ir.Constant(_I64, BLOCK * corner))
+    row = builder.zext(builder.load(builder.gep(rows, [at])), _I64)
+    lane = builder.insert_element(
+        ir.Constant(_V4, ir.Undefined), builder.load(builder.gep(weights, [at])), ir.Constant(_I32, 0)
+    )
+    none = ir.Constant(ir.VectorType(_I32, WIDTH), [0] * WIDTH)
+    return row, builder.shuffle_vector(lane, ir.Constant(_V4, ir.Undefined), none)
+
+
+@intrinsic
+def blend4(typing_context, table, rows, weights, s, x, at):  # type: ignore[no-untyped-def]
+    """x[at:at + 4] (x flat) = sum over the eight corners c of weights[c, s] * table[rows[c, s]]."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        data = [_data(context, builder, signature.args[i], arguments[i]) for i in (0, 1, 2, 4)]
+        total = None
+        for corner in range(8):
+            row, weight = _planned(builder, data[1], data[2], arguments[3], corner)
+            part = builder.fmul(weight, _row(builder, signature.args[0], data[0], row), flags=_FLAGS)
+            total = part if total is None else builder.fadd(part, total, flags=_FLAGS)
+        _store(builder, total, _four(builder, data[3], arguments[5]))
+        return context.get_dummy_value()
+
+    return types.void(table, rows, weights, s, x, at), generate
+
+
+@intrinsic
+def spread4(typing_context, dtable, rows, weights, s, dx, at):  # type: ignore[no-untyped-def]
+    """dtable[rows[c, s]] += weights[c, s] * dx[at:at + 4] (dx flat), for the eight corners c."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        data = [_data(context, builder, signature.args[i], arguments[i]) for i in (0, 1, 2, 4)]
+        gradient = _load(builder, _four(builder, data[3], arguments[5]))
+        table = builder.bitcast(data[0], _V4.as_pointer())
+        for corner in range(8):
+            row, weight = _planned(builder, data[1], data[2], arguments[3], corner)
+            pointer = builder.gep(table, [row])
+            part = builder.fmul(weight, gradient, flags=_FLAGS)
+            _store(builder, builder.fadd(part, _load(builder, pointer), flags=_FLAGS), pointer)
+        return context.get_dummy_value()
+
+    return types.void(dtable, rows, weights, s, dx, at), generate
+
+
+@intrinsic
+def dot4(typing_context, table, row, dx, at):  # type: ignore[no-untyped-def]
+    """Scalar product of table[row] and dx[at:at + 4] (dx flat)."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        left = _row(builder, table, _data(context, builder, signature.args[0], arguments[0]), arguments[1])
+        right = _load(builder, _four(builder, _data(context, builder, signature.args[2], arguments[2]), arguments[3]))
+        product = builder.fmul(left, right, flags=_FLAGS)
+        lanes = [builder.extract_element(product, ir.Constant(_I32, i)) for i in range(WIDTH)]
+        return builder.fadd(builder.fadd(lanes[0], lanes[1]), builder.fadd(lanes[2], lanes[3]))
+
+    return types.float32(table, row, dx, at), generate
+
+
+@intrinsic
+def float_of_bits(typing_context, bits):  # type: ignore[no-untyped-def]
+    """The float32 with these bits (int32)."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.bitcast(arguments[0], _F32)
+
+    return types.float32(types.int32), generate

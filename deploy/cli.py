@@ -27,6 +27,7 @@ COMMANDS = {
     "replay": "run the pipeline again on a recording's frames and compare the poses",
     "info": "what a recording holds, topic by topic, and what it lacks",
     "recover": "save what can be saved of an unfinished or damaged recording",
+    "evaluate": "how well poses are found on a dataset, method by method",
     "bench": "how fast the parts are on this machine",
     "doctor": "check this machine, the bus, the weights, a dataset",
 }

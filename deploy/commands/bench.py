@@ -81,7 +81,7 @@ class Train:
     twin_steps: int = 60
     """Training steps over which the two are compared."""
     out: Path = Path("out/bench")
-    """Folder of the plot, train.png."""
+    """Folder of the fields and of the plot, train.png."""
     json: Path | None = None
     model: FieldConfig = dataclasses.field(default_factory=FieldConfig)
 
@@ -92,7 +92,7 @@ class Train:
         datasets = [(path, _SIZES.get(path.resolve().name, 400)) for path in self.datasets or _all_datasets()]
         with progress_console().status("bench train") as status:
             report = _into(status.update, "bench train")
-            figures = train.measure(datasets, self.model, self.minutes, self.twin_steps, report)
+            figures = train.measure(datasets, self.model, self.minutes, self.twin_steps, self.out, report)
         train.plot(figures, self.out / "train.png")
         write_json(self.json, figures)
         _print_train(figures)

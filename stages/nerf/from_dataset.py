@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from stages.nerf.datasets.assemble import Holdout
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), None: (0.5, 0.5, 0.5)}
-BOUNDED_STEP, CONTRACTED_STEP = 2 / 256, 1 / 128
+BOUNDED_STEP, CONTRACTED_STEP = 2 / 384, 1 / 128
 CONTRACTED_FAR = 64.0
 REPORT_EVERY_S = 0.25
 VALIDATION_STRIDE = 41

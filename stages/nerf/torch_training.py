@@ -26,7 +26,7 @@ class TorchTrainer(Learner):
     ):
         super().__init__(views, space, field, config)
         self._template = new_net(field, self._rng)
-        self._twin = TwinField(self._template, space, self._occupancy.occupied, device)
+        self._twin = TwinField(self._template, self.space, self._occupancy.occupied, device)
         self._adam = torch.optim.Adam(
             self._twin.parameters(), lr=config.learning_rate, betas=(BETA1, BETA2), eps=EPSILON
         )

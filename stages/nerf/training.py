@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from stages.geometry import camera_centre
@@ -33,6 +34,8 @@ OFTEN, SETTLED = 256, 1024
 OCCUPANCY_EVERY = (16, 32, 64)
 FREE_SHARE = 0.2
 DISTORTION = {False: 1e-2, True: 5e-2}
+STRIDE = {False: 1.5, True: 1.0}
+"""Training steps are longer than rendering's, by whether space is contracted: their jitter makes up for it."""
 FIRST_RAYS, RAYS = 512, (256, 1 << 15)
 
 
@@ -52,12 +55,13 @@ class Learner(ABC):
     """A field that is being learnt; each step() improves it. What a batch does is the subclass's."""
 
     def __init__(self, views: list[View], space: Space, field: FieldConfig, config: TrainingConfig):
-        self.config, self.space = config, space
+        self.config = config
+        self.space = msgspec.structs.replace(space, step=space.step * STRIDE[space.contracted])
         self.distortion = DISTORTION[space.contracted] if config.distortion is None else config.distortion
         self._rng = np.random.default_rng(config.seed)
         n = field.occupancy_resolution
         seen = seen_by_cameras(space, n, [(v.camera, v.cam_from_object) for v in views])
-        self._occupancy = OccupancyEstimate(space, n, seen & ~_before_lenses(views, space, n), self._rng)
+        self._occupancy = OccupancyEstimate(self.space, n, seen & ~_before_lenses(views, space, n), self._rng)
         self._bank = RayBank(views, space)
         self._rays = FIRST_RAYS
         self.samples = self.steps = 0

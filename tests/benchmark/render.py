@@ -25,6 +25,7 @@ from stages.nerf.rendering_api import RayRenderer, RenderedView
 from stages.nerf.torch_renderer import TorchRenderer
 from stages.nerf.training import psnr
 from tests.benchmark import machine
+from tests.benchmark.fields import kept_field
 from tests.benchmark.memory import peak_mb
 
 SIZES = (200, 320, 400, 800)
@@ -53,7 +54,7 @@ def field_of(path: Path | None, dataset: Path, size: int, minutes: float, folder
     """The field to measure: the one given, else one trained on the dataset and kept in the folder."""
     if path is not None:
         return path
-    path = folder / f"{dataset.resolve().name}-{size}-{minutes:g}min.safetensors"
+    path = kept_field(folder, dataset, size, minutes)
     if not path.is_file():
         train_field(dataset, path, size, training=TrainingConfig(minutes=minutes))
     return path

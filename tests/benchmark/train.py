@@ -15,7 +15,7 @@ import torch
 
 from stages.nerf.config import FieldConfig, TrainingConfig
 from stages.nerf.datasets import load_dataset
-from stages.nerf.from_dataset import held_out_views, metadata_of, views_of
+from stages.nerf.from_dataset import held_out_views, metadata_of, replace_metadata, views_of
 from stages.nerf.metadata import FieldMetadata
 from stages.nerf.raybank import View
 from stages.nerf.renderer import NumbaRenderer
@@ -23,6 +23,7 @@ from stages.nerf.torch_training import TorchTrainer
 from stages.nerf.training import Learner, Trainer, evaluate
 from tests.benchmark import machine
 from tests.benchmark.depth import depth_error
+from tests.benchmark.fields import kept_field
 from tests.benchmark.memory import peak_mb
 
 CHECKPOINTS_S = (15, 30, 60, 120, 300)
@@ -68,9 +69,9 @@ class Course:
 
 
 def over_time(
-    dataset: Path, size: int, model: FieldConfig, minutes: float, report: Callable[[str], None]
+    dataset: Path, size: int, model: FieldConfig, minutes: float, out: Path, report: Callable[[str], None]
 ) -> Course:
-    """Learn, and measure at each of the checkpoints within the time; measuring takes none of it."""
+    """Learn, and measure at each of the checkpoints within the time, which takes none of it; the field is kept."""
     data = load_dataset(dataset, "train", size)
     views = views_of(data)
     metadata = metadata_of(data, views, model)
@@ -93,16 +94,24 @@ def over_time(
             report(f"{dataset.resolve().name}: {scores[f'{seconds:g}']:.2f} dB after {seconds:g} s")
             if not checkpoints:
                 errors = depth_error(renderer, load_dataset(dataset, "test", size))
+                final = replace_metadata(metadata, psnr_db=scores[f"{seconds:g}"], trained_seconds=spent)
+                learner.field(final).save(kept_field(out, dataset, size, minutes))
             renderer.close()
     return Course(scores, errors)
 
 
 def measure(
-    datasets: Sequence[tuple[Path, int]], model: FieldConfig, minutes: float, steps: int, report: Callable[[str], None]
+    datasets: Sequence[tuple[Path, int]],
+    model: FieldConfig,
+    minutes: float,
+    steps: int,
+    out: Path,
+    report: Callable[[str], None],
 ) -> dict[str, Any]:
     """Everything that `fieldpose bench train` prints, as its JSON.
 
-    The twin takes so many steps on the first dataset; every dataset (its folder, pixels) is learnt for so many minutes.
+    The twin takes so many steps on the first dataset; every dataset (its folder, pixels) is learnt for so many minutes
+    and its field kept in `out`.
     """
     report("the plain twin")
     rates = compare(*datasets[0], model, steps)
@@ -111,7 +120,7 @@ def measure(
     with tempfile.TemporaryDirectory() as folder:
         field = Path(folder) / "field.safetensors"
         memory = peak_mb(_LEARN, "train", first, "--size", size, "--out", field, "--training.steps", 300)
-    courses = {path.resolve().name: over_time(path, size, model, minutes, report) for path, size in datasets}
+    courses = {path.resolve().name: over_time(path, size, model, minutes, out, report) for path, size in datasets}
     return {
         "machine": machine.describe(),
         **rates,

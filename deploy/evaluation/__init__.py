@@ -1,0 +1,1 @@
+"""How well poses are found: pairs of an image and a guess, methods that answer them, scores of the answers."""

@@ -1,0 +1,116 @@
+"""What answers are worth: errors, shares of success, and whether the stated covariance is true.
+
+The keys of a method's scores, which programs may rely on:
+  share_re_below_5deg, share_te_below_0.05  over all pairs; no pose is a failure
+  share_both_below   over all pairs: both errors below their limits
+  share_ok           pairs that got a pose
+  share_ok_right     of these, the ones with both errors below their limits
+  mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te   over the pairs with a pose; null without any
+  seconds_per_image  mean, all passes and refinement included
+  covariance         {50, 90, 99}: share of the true poses inside the ellipsoid of that probability; null without any
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from deploy.evaluation.pairs import Pair
+from deploy.results import CLOSE, CLOSE_DEG
+from stages.geometry import inverse, log_se3, rotation_error_deg, translation_error
+
+_RESAMPLES = 2000
+_DIMENSIONS = 6
+_PROBABILITIES = (50, 90, 99)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A method's answer to a pair; the pose is None where it found none."""
+
+    pair: Pair
+    cam_from_object: np.ndarray | None
+    covariance: np.ndarray | None
+    seconds: float
+
+    @property
+    def errors(self) -> tuple[float, float] | None:
+        """Rotation in degrees and translation; None without a pose."""
+        pose, truth = self.cam_from_object, self.pair.truth
+        return None if pose is None else (rotation_error_deg(pose, truth), translation_error(pose, truth))
+
+    @property
+    def mahalanobis_squared(self) -> float | None:
+        """The error by the stated covariance of the left twist (6, 6); None without one."""
+        if self.cam_from_object is None or self.covariance is None:
+            return None
+        twist = log_se3(self.pair.truth @ inverse(self.cam_from_object))
+        return float(twist @ np.linalg.pinv(self.covariance) @ twist)
+
+
+def score(answers: Sequence[Answer]) -> dict[str, Any]:
+    """The scores of one method over its pairs."""
+    errors = [answer.errors for answer in answers]
+    found = np.array([error for error in errors if error is not None]).reshape(-1, 2)
+    close = found < (CLOSE_DEG, CLOSE)
+    count = len(answers)
+    distances = [d for answer in answers if (d := answer.mahalanobis_squared) is not None]
+    return {
+        "share_re_below_5deg": float(close[:, 0].sum() / count),
+        "share_te_below_0.05": float(close[:, 1].sum() / count),
+        "share_both_below": float(close.all(axis=1).sum() / count),
+        "share_ok": len(found) / count,
+        "share_ok_right": float(close.all(axis=1).mean()) if len(found) else None,
+        **_statistics("re_deg", found[:, 0]),
+        **_statistics("te", found[:, 1]),
+        "seconds_per_image": float(np.mean([answer.seconds for answer in answers])),
+        "covariance": _coverage(distances),
+    }
+
+
+def _statistics(name: str, values: np.ndarray) -> dict[str, float | None]:
+    if len(values) == 0:
+        return {f"{what}_{name}": None for what in ("mean", "median", "p90")}
+    return {
+        f"mean_{name}": float(values.mean()),
+        f"median_{name}": float(np.median(values)),
+        f"p90_{name}": float(np.quantile(values, 0.9)),
+    }
+
+
+def _coverage(distances: Sequence[float]) -> dict[str, float] | None:
+    if not distances:
+        return None
+    squared = np.array(distances)
+    return {str(p): float((squared <= chi2.ppf(p / 100, _DIMENSIONS)).mean()) for p in _PROBABILITIES}
+
+
+def difference(first: Sequence[Answer], second: Sequence[Answer]) -> dict[str, Any]:
+    """How much larger the first method's errors are, over the pairs that both answered: mean and its 95 % interval.
+
+    The interval is of the bootstrap over images' pairs, resampled together for both methods.
+    """
+    both = [(a.errors, b.errors) for a, b in zip(first, second, strict=True) if a.errors and b.errors]
+    if not both:
+        return {"pairs": 0, "re_deg": None, "te": None}
+    gaps = np.array([np.subtract(a, b) for a, b in both if a is not None and b is not None])
+    places = np.random.default_rng(0).integers(0, len(gaps), (_RESAMPLES, len(gaps)))
+    low, high = np.quantile(gaps[places].mean(axis=1), (0.025, 0.975), axis=0)
+    mean = gaps.mean(axis=0)
+    return {
+        "pairs": len(gaps),
+        **{
+            name: {"mean": float(mean[i]), "low": float(low[i]), "high": float(high[i])}
+            for i, name in enumerate(("re_deg", "te"))
+        },
+    }
+
+
+def curve(answers: Sequence[Answer], which: int, limits: np.ndarray) -> np.ndarray:
+    """Share of all pairs whose rotation (`which` 0) or translation (1) error is below each limit."""
+    errors = np.array([np.inf if answer.errors is None else answer.errors[which] for answer in answers])
+    return np.array([(errors < limit).mean() for limit in limits])

@@ -1,0 +1,109 @@
+"""Pairs are drawn as published, scores are what they say, and the command runs over the demo scene."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from deploy.cli import main
+from deploy.evaluation.pairs import PROTOCOLS, Pair, draw
+from deploy.evaluation.scores import Answer, curve, difference, score
+from deploy.scene import demo_file
+from stages.geometry import camera_centre, exp_se3, look_at, rotation_about
+
+TRUTHS = [look_at((4 * np.cos(a), 4 * np.sin(a), 1.0), (0, 0, 0), (0, 0, 1)) for a in np.arange(7.0)]
+
+
+def answer(re_deg: float | None, te: float = 0.0, seconds: float = 1.0) -> Answer:
+    """One whose errors are known; no pose where the rotation is None."""
+    pair = Pair(0, 0, np.eye(4), np.eye(4))
+    if re_deg is None:
+        return Answer(pair, None, None, seconds)
+    pose = rotation_about((0, 0, 1), np.deg2rad(re_deg))
+    pose[0, 3] = te
+    return Answer(pair, pose, None, seconds)
+
+
+def test_the_same_seed_draws_the_same_pairs_within_the_protocols_limits() -> None:
+    protocol = PROTOCOLS["nerf-synthetic"]
+    pairs, again = draw(protocol, TRUTHS, (0, 1)), draw(protocol, TRUTHS, (0, 1))
+    assert len(pairs) == 50
+    for one, other in zip(pairs, again, strict=True):
+        assert one.image == other.image
+        np.testing.assert_array_equal(one.guess, other.guess)
+    assert {pair.image for pair in pairs[:25]} != {pair.image for pair in pairs[25:]}
+    for pair in pairs:
+        assert 10 - 1e-6 <= pair.guess_error[0] <= 40 + 1e-6
+        distance = np.linalg.norm(camera_centre(pair.guess))
+        assert abs(distance - np.linalg.norm(camera_centre(pair.truth))) <= 0.2 + 1e-9
+
+
+def test_scores_by_hand() -> None:
+    scores = score([answer(1, 0.01), answer(2, 0.1), answer(30, 0.02, seconds=5), answer(None)])
+    assert scores["share_re_below_5deg"] == 0.5
+    assert scores["share_te_below_0.05"] == 0.5
+    assert scores["share_both_below"] == 0.25
+    assert scores["share_ok"] == 0.75
+    assert scores["share_ok_right"] == pytest.approx(1 / 3)
+    assert scores["mean_re_deg"] == pytest.approx(11)
+    assert scores["median_re_deg"] == pytest.approx(2)
+    assert scores["seconds_per_image"] == 2
+    assert scores["covariance"] is None
+
+
+def test_without_any_pose_the_errors_are_unknown() -> None:
+    scores = score([answer(None), answer(None)])
+    assert scores["share_ok"] == scores["share_re_below_5deg"] == 0
+    assert scores["mean_re_deg"] is scores["share_ok_right"] is None
+
+
+def test_a_true_covariance_covers_what_it_says() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6)) * 1e-3
+    covariance = root @ root.T
+    pair = Pair(0, 0, TRUTHS[0], TRUTHS[0])
+    answers = [Answer(pair, exp_se3(-(root @ rng.normal(size=6))) @ TRUTHS[0], covariance, 0.0) for _ in range(4000)]
+    covered = score(answers)["covariance"]
+    assert [covered[p] for p in ("50", "90", "99")] == pytest.approx([0.5, 0.9, 0.99], abs=0.03)
+
+
+def test_differences_are_taken_pair_by_pair() -> None:
+    rng = np.random.default_rng(1)
+    base = rng.uniform(0, 10, 60)
+    first = [answer(b + 0.5, 0.02) for b in base] + [answer(None)]
+    second = [answer(b, 0.02) for b in base] + [answer(1)]
+    gap = difference(first, second)
+    assert gap["pairs"] == 60
+    assert gap["re_deg"] == pytest.approx({"mean": 0.5, "low": 0.5, "high": 0.5})
+    assert gap["te"]["mean"] == pytest.approx(0)
+    assert difference([answer(None)], [answer(1)])["pairs"] == 0
+
+
+def test_success_curves_count_missing_poses_as_failures() -> None:
+    answers = [answer(1), answer(3), answer(None), answer(20)]
+    np.testing.assert_allclose(curve(answers, 0, np.array([0.5, 2, 5, 180])), [0, 0.25, 0.5, 0.75])
+
+
+def test_methods_are_compared_on_the_demo_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    field = demo_file("field.safetensors")
+    figures, plot = tmp_path / "scores.json", tmp_path / "curves.png"
+    arguments = ["evaluate", field, field.parent, "--method", "one-step", "--method", "full", "--seeds", 0]
+    arguments += ["--images", 2, "--poses", 1, "--size", 320, "--json", figures, "--plot", plot]
+    assert main([str(argument) for argument in arguments]) == 0
+    written = json.loads(figures.read_text())
+    assert written["pairs"] == 2
+    assert list(written["methods"]) == ["one-step", "full"]
+    assert written["methods"]["full"]["share_both_below"] == 1
+    assert written["methods"]["full"]["mean_re_deg"] < 0.5
+    assert written["differences"]["full"]["pairs"] >= 1
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert "ok and right" in capsys.readouterr().out
+
+
+def test_an_unknown_method_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    field = demo_file("field.safetensors")
+    assert main(["evaluate", str(field), str(field.parent), "--method", "guessing"]) == 2
+    assert "method 'guessing': expected one of one-step," in capsys.readouterr().err

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from deploy.evaluation.pairs import Pair
     from deploy.evaluation.scores import Answer
     from stages.nerf.datasets import Dataset
-    from stages.nerf.field import Field
+    from stages.nerf.rendering_api import RayRenderer
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,8 @@ class Options:
         from deploy.evaluation.scores import difference, score
         from stages.nerf.datasets import load_dataset
         from stages.nerf.field import load_field
+        from stages.nerf.loading import make_renderer
+        from stages.tracking.views import training_views
 
         check_writable(self.json, self.plot)
         names = self.method or tuple(METHODS)
@@ -77,7 +79,8 @@ class Options:
         truths = [record.cam_from_object for record in dataset.images]
         protocol = dataclasses.replace(pairs.PROTOCOLS[self.protocol], images=self.images, poses=self.poses)
         drawn = pairs.draw(protocol, truths, self.seeds)
-        answers = {name: list(self._answers(name, field, dataset, drawn)) for name in names}
+        renderer, scale = make_renderer(field, threads=0), training_views(field.metadata).scale
+        answers = {name: list(self._answers(name, renderer, scale, dataset, drawn)) for name in names}
         scores = {name: score(given) for name, given in answers.items()}
         first = names[0]
         figures = {
@@ -96,20 +99,20 @@ class Options:
         _print(figures)
         return 0
 
-    def _answers(self, name: str, field: Field, dataset: Dataset, drawn: Sequence[Pair]) -> Iterator[Answer]:
+    def _answers(
+        self, name: str, renderer: RayRenderer, scale: float, dataset: Dataset, drawn: Sequence[Pair]
+    ) -> Iterator[Answer]:
         """A method's answers, each from a fresh start."""
         from deploy.evaluation.methods import METHODS
         from deploy.evaluation.scores import Answer
         from deploy.single import PoseFinder
-        from stages.nerf.loading import make_renderer
-        from stages.tracking.views import training_views
 
         settings = METHODS[name](self.settings)
         # Guesses are independent of each other: no view rendered for one may serve the next.
         settings = dataclasses.replace(
             settings, rendering=dataclasses.replace(settings.rendering, reuse_angle_deg=0.0)
         )
-        finder = PoseFinder(make_renderer(field, threads=0), settings, training_views(field.metadata).scale)
+        finder = PoseFinder(renderer, settings, scale)
         images = {pair.image: dataset.load_rgb(pair.image) for pair in drawn}
         finder.find(images[drawn[0].image], dataset.images[drawn[0].image].camera, drawn[0].guess)
         for pair in track(drawn, description=name, console=progress_console()):

@@ -195,15 +195,20 @@ def psnr(mean_squared_error: float) -> float:
     return float(-10 * np.log10(max(mean_squared_error, 1e-12)))
 
 
+def colours(view: View, metadata: FieldMetadata) -> np.ndarray:
+    """What a field should show for a view, (h, w, 3) in 0..1: transparent parts have the field's background."""
+    image = view.image / 255.0
+    if image.shape[2] == 3:
+        return image
+    return image[..., :3] * image[..., 3:] + (1 - image[..., 3:]) * np.array(metadata.background)
+
+
 def evaluate(renderer: NumbaRenderer, views: list[View], every: int = 1) -> list[float]:
     """PSNR of each view over every so-manieth pixel, its transparent parts over the field's background."""
     result = []
-    background = np.array(renderer.metadata.background)
     for view in views:
         origins, directions = rays(view.camera, view.cam_from_object, view.camera.grid()[::every])
         rendered = renderer.render_rays(origins, directions).rgb
-        truth = view.image.reshape(-1, view.image.shape[2])[::every] / 255.0
-        if truth.shape[1] == 4:
-            truth = truth[:, :3] * truth[:, 3:] + (1 - truth[:, 3:]) * background
+        truth = colours(view, renderer.metadata).reshape(-1, 3)[::every]
         result.append(psnr(float(np.mean((rendered - truth) ** 2))))
     return result

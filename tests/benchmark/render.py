@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
+import msgspec
 import numpy as np
 import torch
 
@@ -17,13 +18,13 @@ from stages.geometry.cameras import rays
 from stages.nerf.config import TrainingConfig
 from stages.nerf.datasets import load_dataset
 from stages.nerf.field import Field, load_field
-from stages.nerf.from_dataset import train_field, views_of
+from stages.nerf.from_dataset import replace_metadata, train_field, views_of
 from stages.nerf.kernels.types import Net
 from stages.nerf.raybank import View
 from stages.nerf.renderer import NumbaRenderer
 from stages.nerf.rendering_api import RayRenderer, RenderedView
 from stages.nerf.torch_renderer import TorchRenderer
-from stages.nerf.training import psnr
+from stages.nerf.training import colours, psnr
 from tests.benchmark import machine
 from tests.benchmark.fields import kept_field
 from tests.benchmark.memory import peak_mb
@@ -133,20 +134,13 @@ def _timed(renderer: RayRenderer, view: View) -> Timed:
 
 
 def _psnr(rendered: RenderedView, view: View, field: Field) -> float:
-    truth = view.image / 255
-    if truth.shape[2] == 4:
-        truth = truth[..., :3] * truth[..., 3:] + (1 - truth[..., 3:]) * np.array(field.metadata.background)
-    return psnr(float(np.mean((rendered.rgb / 255 - truth) ** 2)))
+    return psnr(float(np.mean((rendered.rgb / 255 - colours(view, field.metadata)) ** 2)))
 
 
 def _with_step(field: Field, factor: float) -> Field:
     space = field.metadata.space
-    metadata = _changed(field.metadata, space=_changed(space, step=space.step * factor))
+    metadata = replace_metadata(field.metadata, space=msgspec.structs.replace(space, step=space.step * factor))
     return Field(metadata, field.net, field.occupied)
-
-
-def _changed(struct: Any, **values: Any) -> Any:
-    return type(struct)(**{name: getattr(struct, name) for name in struct.__struct_fields__} | values)
 
 
 def _with_tables(net: Net, factor: int) -> Net:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 import numpy as np
 
-from bus.messages import Reason
+from bus.messages import GuessReason, Reason
 from deploy.settings import Settings
 from stages.geometry import Camera
 from stages.lifting.core import Lifted, lift
@@ -18,9 +18,13 @@ from stages.nerf.rendering_api import RayRenderer
 from stages.pnp.core import PnpResult, solve
 from stages.refinement.core import RefinementResult, refine
 from stages.rendering.core import SourcedView, ViewSource
-from stages.tracking.distance import Limit
+from stages.tracking.frame_policies import EachFramePolicy
+from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
+from stages.tracking.views import TrainingViews
 
 T = TypeVar("T")
+
+_FRAME = FrameInfo(frame_id=0, capture_ns=0)
 
 
 @dataclass
@@ -46,33 +50,30 @@ class PoseFound:
 
 
 class PoseFinder:
-    """Renders, matches, lifts, solves and refines, again from the pose found until it settles.
+    """Renders, matches, lifts, solves and refines, again and from elsewhere until a pose is believed.
 
-    `scale` is the length by which the settings' shares are measured. Raises ConfigError and WeightsError.
+    `views` are the field's training views. Raises ConfigError and WeightsError.
     """
 
-    def __init__(self, renderer: RayRenderer, settings: Settings, scale: float) -> None:
-        self._renderer = renderer
-        self._settings = settings
+    def __init__(self, renderer: RayRenderer, settings: Settings, views: TrainingViews) -> None:
+        self._renderer, self._settings, self._training_views = renderer, settings, views
         self._views = ViewSource(renderer, settings.rendering)
         self._matcher = PairMatcher(build_matcher(settings.matching), settings.matching)
-        tracking = settings.tracking
-        self._settled = Limit(tracking.settled_deg, tracking.settled * scale)
 
     def find(self, image: np.ndarray, camera: Camera, guess: np.ndarray) -> PoseFound:
-        """The pose of an image (h, w, 3) uint8 from a guessed cam_from_object (4, 4); the last good pass counts."""
+        """The pose of an image (h, w, 3) uint8 from a guessed cam_from_object (4, 4); see EachFramePolicy."""
+        policy = EachFramePolicy(self._settings.tracking, self._training_views, {_FRAME.frame_id: guess})
         rng = np.random.default_rng(self._settings.tracking.seed)
-        found = self.one_pass(image, camera, guess, rng)
-        for passes in range(2, self._settings.tracking.passes + 1):
-            pose = found.cam_from_object
-            if pose is None or self._settled.holds(guess, pose):
+        attempt = Attempt(_FRAME, PoseGuess(GuessReason.PRIOR, guess), sent_ns=0)
+        tried: list[PoseFound] = []
+        while True:
+            tried.append(self.one_pass(image, camera, attempt.guess.cam_from_object, rng))
+            result = _result(tried[-1], attempt.pass_index)
+            further = policy.next_guess(attempt, result)
+            if further is None:
                 break
-            again = self.one_pass(image, camera, pose, rng)
-            if not again.ok:
-                break
-            guess, found = pose, again
-            found.passes = passes
-        return found
+            attempt = attempt.again(further, result, now_ns=0)
+        return _concluded(tried, policy.conclude(attempt, result))
 
     def one_pass(self, image: np.ndarray, camera: Camera, guess: np.ndarray, rng: np.random.Generator) -> PoseFound:
         """One way through the stages."""
@@ -91,7 +92,7 @@ class PoseFinder:
         if kept.sum() < self._settings.lifting.min_kept:
             return PoseFound(Reason.TOO_FEW_CONSISTENT_POINTS, stage_ms=clock.ms)
         pixels, points, confidence = matched.pixels_b[kept], lifted.points_in_object[kept], matched.confidence[kept]
-        solved = clock.time("pnp", lambda: solve(pixels, points, camera, self._settings.pnp, confidence))
+        solved = clock.time("pnp", lambda: solve(pixels, points, camera, self._settings.pnp, confidence, guess))
         if solved.cam_from_object is None:
             return PoseFound(Reason(solved.reason), correspondences=len(pixels), stage_ms=clock.ms)
         pose = solved.cam_from_object
@@ -109,6 +110,23 @@ class PoseFinder:
         )  # fmt: skip
 
 
+def _result(found: PoseFound, pass_index: int) -> PoseResult:
+    return PoseResult(
+        _FRAME.frame_id, pass_index, found.ok, found.cam_from_object, found.covariance, found.inliers,
+        found.correspondences, found.residual_px,
+    )  # fmt: skip
+
+
+def _concluded(tried: Sequence[PoseFound], belief: Belief) -> PoseFound:
+    """The one of the passes' results that is believed, else why there is none."""
+    last = tried[-1]
+    for found in reversed(tried):
+        if found.ok and found.cam_from_object is belief.cam_from_object:
+            return replace(found, passes=len(tried))
+    reason = Reason.IMPLAUSIBLE_POSE if last.ok else last.reason
+    return PoseFound(reason, correspondences=last.correspondences, passes=len(tried), stage_ms=last.stage_ms)
+
+
 class _Clock:
     def __init__(self) -> None:
         self.ms: dict[str, float] = {}
@@ -124,7 +142,7 @@ def _found(solved: PnpResult, refined: RefinementResult, correspondences: int, m
     return PoseFound(
         reason=Reason.OK,
         cam_from_object=refined.cam_from_object,
-        covariance=solved.covariance,
+        covariance=solved.covariance if refined.covariance is None else refined.covariance,
         inliers=int(solved.inliers.sum()),
         correspondences=correspondences,
         residual_px=solved.residual_px,

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any
 
 import tyro
 from rich.table import Table
 
-import deploy
-from deploy.errors import UsageError
 from deploy.output import check_writable, progress_console, result_console, write_json
+from deploy.repository import ROOT, benchmark
 from deploy.scene import demo_file
 from stages.nerf.config import FieldConfig
 
-_ROOT = Path(deploy.__file__).resolve().parent.parent
-_DATA = _ROOT.parent / "shared" / "data"
+_DATA = ROOT.parent / "shared" / "data"
 _SIZES = {"lego": 400, "demo": 400, "fern": 504, "fox": 480}
 
 
@@ -52,7 +47,7 @@ class Render:
     def run(self) -> int:
         """Measure, print, plot."""
         check_writable(self.json)
-        render = _benchmark("render")
+        render = benchmark("render")
         dataset = self.dataset or _first_dataset()
         with progress_console().status("training the field") as status:
             path = render.field_of(self.field, dataset, 400, self.minutes, self.out)
@@ -88,7 +83,7 @@ class Train:
     def run(self) -> int:
         """Measure, print, plot."""
         check_writable(self.json)
-        train = _benchmark("train")
+        train = benchmark("train")
         datasets = [(path, _SIZES.get(path.resolve().name, 400)) for path in self.datasets or _all_datasets()]
         with progress_console().status("bench train") as status:
             report = _into(status.update, "bench train")
@@ -114,15 +109,6 @@ class Options:
     def run(self) -> int:
         """Run the benchmark that was asked for."""
         return self.what.run()
-
-
-def _benchmark(name: str) -> ModuleType:
-    """A module of tests/benchmark, which is part of the repository but not of an installed package."""
-    if not (_ROOT / "tests" / "benchmark").is_dir():
-        raise UsageError("the benchmarks are part of the repository: clone it, and `make install` there")
-    if str(_ROOT) not in sys.path:
-        sys.path.append(str(_ROOT))
-    return importlib.import_module(f"tests.benchmark.{name}")
 
 
 def _all_datasets() -> list[Path]:

@@ -61,7 +61,7 @@ class Options:
         views = training_views(field.metadata)
         guess = start_pose(self.guess, views)
         renderer = make_renderer(field, threads=0)
-        finder = PoseFinder(renderer, self.settings, views.scale)
+        finder = PoseFinder(renderer, self.settings, views)
         began = time.perf_counter()
         found = finder.find(image, camera, guess)
         seconds = time.perf_counter() - began

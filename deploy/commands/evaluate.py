@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 import tyro
 from rich.progress import track
 from rich.table import Table
@@ -18,9 +19,12 @@ from deploy.output import check_writable, progress_console, result_console, writ
 from deploy.settings import Settings
 
 if TYPE_CHECKING:
-    from deploy.evaluation.pairs import Pair
+    from deploy.evaluation.methods import Finder
+    from deploy.evaluation.pairs import Pair, Protocol
     from deploy.evaluation.scores import Answer
+    from deploy.evaluation.surface import Surface
     from stages.nerf.datasets import Dataset
+    from stages.nerf.field import Field
     from stages.nerf.rendering_api import RayRenderer
 
 
@@ -31,24 +35,40 @@ class Options:
     Example: fieldpose evaluate out/lego.safetensors ../shared/data/lego --method one-step --method full
 
     nerf-synthetic: 5 images, 5 guesses each, turned by 10 to 40 degrees about the origin and shifted by up to 0.2;
-    llff: up to 40 degrees and 0.1. The same seed gives the same pairs for every method. The JSON file has: protocol,
-    pairs, seeds, methods (name -> share_re_below_5deg, share_te_below_0.05, share_both_below, share_ok,
-    share_ok_right, mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te, seconds_per_image, covariance),
-    differences (name -> mean and 95 % interval of how much larger its errors are than the first method's).
+    llff: up to 40 degrees and 0.1; occluded: the same, with things pasted over a part of the image; reach: by turns
+    turned by up to 180 degrees and shifted by up to the object's diameter. The same seed gives the same pairs for
+    every method. The JSON file has: protocol, unit, pairs, seeds, covered, diameter, methods (name -> pairs,
+    share_re_below_5deg, share_te_below_0.05, share_both_below, share_ok, share_ok_right, share_of_solvable,
+    mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te, seconds_per_image, covariance, add),
+    differences (name -> than, and mean and 95 % interval of how much larger its errors are than that method's).
     """
 
     field: tyro.conf.Positional[Path]
     """The field (.safetensors)."""
     dataset: tyro.conf.Positional[Path]
     """The dataset; its held-out images are used."""
-    protocol: Literal["nerf-synthetic", "llff"] = "nerf-synthetic"
+    protocol: Literal["nerf-synthetic", "llff", "occluded", "reach"] = "nerf-synthetic"
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """one-step, one-step-unmined, passes, full or full-anywhere; may be given several times, all by default."""
+    """one-step, one-step-unmined, passes and full are the default; also one-step-refined, with -anywhere or -adam,
+    and the published inerf, inerf-2048, pi-nerf, pi-nerf-published, essential; may be given several times, or all."""
     seeds: tuple[int, ...] = (0, 1, 2, 3)
     images: int = 5
     """Held-out images a seed."""
-    poses: int = 5
-    """Guesses an image."""
+    poses: int = 0
+    """Guesses an image; 0: what the protocol has, 5, or 10 for reach."""
+    angle_deg: tuple[float, float] | None = None
+    """Turn the guesses by other angles than the protocol's."""
+    shift: float | None = None
+    """Shift them by up to another length."""
+    turn_about: Literal["origin", "camera"] = "origin"
+    """Turn them about the dataset's origin, or the camera about itself."""
+    occluders: Path | None = None
+    """Dataset with transparent backgrounds whose objects are pasted over occluded images; blobs are painted if none
+    is given."""
+    surface: Path | None = None
+    """Points (n, 3) of the object's surface (.npy) for the ADD scores; taken from the field where none are given."""
+    slow_pairs: int = 25
+    """Give methods that take seconds an image only the first so many pairs; 0: all."""
     size: int = 400
     """Shrink images whose longer side has more pixels."""
     json: Path | None = None
@@ -62,85 +82,180 @@ class Options:
     def run(self) -> int:
         """Evaluate, print the table."""
         from deploy.evaluation import pairs
-        from deploy.evaluation.methods import METHODS
-        from deploy.evaluation.scores import difference, score
         from stages.nerf.datasets import load_dataset
         from stages.nerf.field import load_field
         from stages.nerf.loading import make_renderer
-        from stages.tracking.views import training_views
 
         check_writable(self.json, self.plot)
-        names = self.method or tuple(METHODS)
-        unknown = [name for name in names if name not in METHODS]
-        if unknown:
-            raise UsageError(f"method {unknown[0]!r}: expected one of {', '.join(METHODS)}")
+        names = self._methods()
         field = load_field(self.field)
-        dataset = load_dataset(self.dataset, "test", self.size)
-        truths = [record.cam_from_object for record in dataset.images]
-        protocol = dataclasses.replace(pairs.PROTOCOLS[self.protocol], images=self.images, poses=self.poses)
-        drawn = pairs.draw(protocol, truths, self.seeds)
-        renderer, scale = make_renderer(field, threads=0), training_views(field.metadata).scale
-        answers = {name: list(self._answers(name, renderer, scale, dataset, drawn)) for name in names}
-        scores = {name: score(given) for name, given in answers.items()}
-        first = names[0]
+        renderer = make_renderer(field, threads=0)
+        dataset, surface = load_dataset(self.dataset, "test", self.size), self._surface(field, renderer)
+        protocol = self._protocol(surface)
+        drawn = pairs.draw(protocol, [record.cam_from_object for record in dataset.images], self.seeds)
+        images, covered = self._images(dataset, drawn, protocol)
+        answers = {name: list(self._answers(name, field, renderer, dataset, images, drawn)) for name in names}
         figures = {
             "protocol": dataclasses.asdict(protocol),
             "unit": dataset.unit,
             "pairs": len(drawn),
             "seeds": list(self.seeds),
-            "methods": scores,
-            "differences": {name: difference(answers[name], answers[first]) for name in names[1:]},
+            "covered": covered,
+            "diameter": None if surface is None else surface.diameter,
+            **_scores(answers, surface),
         }
         write_json(self.json, figures)
-        if self.plot is not None:
-            from deploy.evaluation.plots import plot_success
-
-            plot_success(answers, self.plot, f"{self.field.name}, {len(drawn)} pairs, {self.protocol}")
+        self._draw(answers, surface)
         _print(figures)
         return 0
 
+    def _methods(self) -> Sequence[str]:
+        from deploy.evaluation.methods import DEFAULT, METHODS
+
+        if self.method == ("all",):
+            return tuple(METHODS)
+        unknown = [name for name in self.method if name not in METHODS]
+        if unknown:
+            raise UsageError(f"method {unknown[0]!r}: expected all, or one of {', '.join(METHODS)}")
+        return tuple(dict.fromkeys(self.method)) or DEFAULT
+
+    def _protocol(self, surface: Surface | None) -> Protocol:
+        from deploy.evaluation.pairs import PROTOCOLS
+
+        protocol = PROTOCOLS[self.protocol]
+        shift = protocol.max_translation if self.shift is None else self.shift
+        if protocol.in_turn and self.shift is None:
+            if surface is None:
+                raise UsageError("reach: this field has no bounds, so that shifts have no measure; give --shift")
+            shift = surface.diameter
+        return dataclasses.replace(
+            protocol, images=self.images, poses=self.poses or protocol.poses, turn_about=self.turn_about,
+            angle_deg=self.angle_deg or protocol.angle_deg, max_translation=shift,
+        )  # fmt: skip
+
+    def _surface(self, field: Field, renderer: RayRenderer) -> Surface | None:
+        """The object's surface; None for a scene without bounds."""
+        from deploy.evaluation.surface import read_surface, surface_of
+
+        if self.surface is not None:
+            return read_surface(self.surface)
+        if field.metadata.space.contracted:
+            return None
+        return surface_of(renderer, field.metadata.cameras, np.random.default_rng(0))
+
+    def _images(
+        self, dataset: Dataset, drawn: Sequence[Pair], protocol: Protocol
+    ) -> tuple[Mapping[tuple[int, int], np.ndarray], float | None]:
+        """Images by (seed, place), and the share of their pixels that is covered."""
+        from deploy.evaluation.occlusion import objects_of, occluded, painted
+        from stages.nerf.datasets import load_dataset
+
+        images = {(pair.seed, pair.image): dataset.load_rgb(pair.image) for pair in drawn}
+        if not protocol.occluded:
+            return images, None
+        thing = painted if self.occluders is None else objects_of(load_dataset(self.occluders, "test", self.size))
+        covered = {key: occluded(image, np.random.default_rng(key), thing) for key, image in images.items()}
+        share = float(np.mean([hidden.mean() for _, hidden in covered.values()]))
+        return {key: image for key, (image, _) in covered.items()}, share
+
     def _answers(
-        self, name: str, renderer: RayRenderer, scale: float, dataset: Dataset, drawn: Sequence[Pair]
+        self,
+        name: str,
+        field: Field,
+        renderer: RayRenderer,
+        dataset: Dataset,
+        images: Mapping[tuple[int, int], np.ndarray],
+        drawn: Sequence[Pair],
     ) -> Iterator[Answer]:
         """A method's answers, each from a fresh start."""
         from deploy.evaluation.methods import METHODS
         from deploy.evaluation.scores import Answer
-        from deploy.single import PoseFinder
+        from stages.tracking.views import training_views
 
-        settings = METHODS[name](self.settings)
-        # Guesses are independent of each other: no view rendered for one may serve the next.
-        settings = dataclasses.replace(
-            settings, rendering=dataclasses.replace(settings.rendering, reuse_angle_deg=0.0)
-        )
-        finder = PoseFinder(renderer, settings, scale)
-        images = {pair.image: dataset.load_rgb(pair.image) for pair in drawn}
-        finder.find(images[drawn[0].image], dataset.images[drawn[0].image].camera, drawn[0].guess)
-        for pair in track(drawn, description=name, console=progress_console()):
+        method = METHODS[name]
+        finder: Finder = method.make(renderer, self.settings, training_views(field.metadata))
+        if method.slow and self.slow_pairs:
+            drawn = drawn[: self.slow_pairs]
+        for i, pair in enumerate(track(drawn, description=name, console=progress_console())):
+            image, camera = images[pair.seed, pair.image], dataset.images[pair.image].camera
+            if i == 0 and not method.slow:
+                finder.find(image, camera, pair.guess)  # networks and kernels are slow the first time
             began = time.perf_counter()
-            found = finder.find(images[pair.image], dataset.images[pair.image].camera, pair.guess)
-            yield Answer(pair, found.cam_from_object, found.covariance, time.perf_counter() - began)
+            found = finder.find(image, camera, pair.guess)
+            seconds = time.perf_counter() - began
+            yield Answer(pair, found.cam_from_object, found.covariance, seconds, method.scale_known)
+
+    def _draw(self, answers: Mapping[str, Sequence[Answer]], surface: Surface | None) -> None:
+        from deploy.evaluation.plots import plot_reach, plot_success
+
+        if self.plot is None:
+            return
+        count = max(len(given) for given in answers.values())
+        title = f"{self.field.name}, {self.protocol}, {count} pairs"
+        if self.protocol == "reach":
+            plot_reach(answers, self.plot, title, self.shift or (surface.diameter if surface else 1.0))
+        else:
+            plot_success(answers, self.plot, title)
+
+
+def _scores(answers: Mapping[str, Sequence[Answer]], surface: Surface | None) -> dict[str, Any]:
+    from deploy.evaluation.methods import METHODS
+    from deploy.evaluation.scores import difference, score, share_of_solvable
+
+    first, *others = answers
+    whole = {name: METHODS[name].ablates or first for name in others}
+    than = {name: other if other in answers else first for name, other in whole.items()}
+    return {
+        "methods": {
+            name: {**score(given, surface), "share_of_solvable": share_of_solvable(given, list(answers.values()))}
+            for name, given in answers.items()
+        },
+        "differences": {
+            name: {"than": other, **difference(answers[name], answers[other])} for name, other in than.items()
+        },
+    }
 
 
 def _print(figures: dict[str, Any]) -> None:
-    console = result_console()
-    console.print(
+    console, protocol = result_console(), figures["protocol"]
+    least, most = protocol["angle_deg"]
+    lines = [
         f"{figures['pairs']} pairs (seeds {', '.join(map(str, figures['seeds']))}), lengths in: {figures['unit']}",
-        highlight=False,
-    )
+        f"{protocol['name']}: guesses turned by {least:g} to {most:g} degrees about the {protocol['turn_about']}"
+        f" {'or' if protocol['in_turn'] else 'and'} shifted by up to {protocol['max_translation']:.3g}",
+    ]
+    if figures["covered"] is not None:
+        lines.append(f"{figures['covered']:.0%} of the images are covered")
+    for line in lines:
+        console.print(line, highlight=False)
+    console.print(_table(figures["methods"]))
+    for name, gap in figures["differences"].items():
+        if gap["re_deg"] is not None:
+            gaps = f"RE {_gap(gap['re_deg'])}, TE {_gap(gap['te'])}"
+            console.print(f"{name} against {gap['than']}: {gaps}", highlight=False)
+
+
+def _table(methods: dict[str, Any]) -> Table:
     table = Table()
-    columns = ("method", "< 5 deg", "< 0.05", "ok", "ok and right", "RE mean", "median", "TE mean", "median", "s")
+    columns = ("method", "pairs", "< 5 deg", "< 0.05", "ok", "ok & right")
+    columns += ("RE mean", "median", "TE mean", "median", "s")
     for column in columns:
         table.add_column(column, justify="left" if column == "method" else "right")
-    for name, row in figures["methods"].items():
+    for name, row in methods.items():
         shares = ("share_re_below_5deg", "share_te_below_0.05", "share_ok", "share_ok_right")
         errors = (("mean_re_deg", 3), ("median_re_deg", 3), ("mean_te", 5), ("median_te", 5))
         table.add_row(
             name,
+            str(row["pairs"]),
             *(_number(row[share], 3) for share in shares),
             *(_number(row[error], digits) for error, digits in errors),
             f"{row['seconds_per_image']:.2f}",
         )
-    console.print(table)
+    return table
+
+
+def _gap(gap: dict[str, float] | None) -> str:
+    return "-" if gap is None else f"{gap['mean']:+.3g} ({gap['low']:+.3g} to {gap['high']:+.3g})"
 
 
 def _number(value: float | None, digits: int) -> str:

@@ -1,13 +1,75 @@
-"""The ways to find a pose that are compared, each a change of the settings."""
+"""The ways to find a pose that are compared: changes of the settings, and published methods on the same field."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
+import numpy as np
+
+from bus.messages import Reason
+from deploy.repository import benchmark
 from deploy.settings import Settings
+from deploy.single import PoseFinder, PoseFound
+from stages.geometry import Camera
+from stages.nerf.rendering_api import RayRenderer
+from stages.tracking.views import TrainingViews
 
-Change = Callable[[Settings], Settings]
+
+class Finder(Protocol):
+    """Finds poses by a method."""
+
+    def find(self, image: np.ndarray, camera: Camera, guess: np.ndarray) -> PoseFound:
+        """The pose of an image (h, w, 3) uint8 from a guessed cam_from_object (4, 4)."""
+        ...
+
+
+@dataclass(frozen=True)
+class Method:
+    """How to make a finder, and what to expect of it.
+
+    slow: takes seconds an image. scale_known: whether its translations mean anything. ablates: the method it is to
+    be compared with, where it is that method with a part left out.
+    """
+
+    make: Callable[[RayRenderer, Settings, TrainingViews], Finder]
+    slow: bool = False
+    scale_known: bool = True
+    ablates: str | None = None
+
+
+class _Baseline:
+    """A published method of tests/benchmark/baselines; it always believes its answer."""
+
+    def __init__(self, method: Any) -> None:
+        self._method = method
+
+    def find(self, image: np.ndarray, camera: Camera, guess: np.ndarray) -> PoseFound:
+        pose = self._method.find(image, camera, guess)
+        return PoseFound(Reason.NO_CONSENSUS) if pose is None else PoseFound(Reason.OK, pose)
+
+
+def _ours(change: Callable[[Settings], Settings], ablates: str | None = None) -> Method:
+    def make(renderer: RayRenderer, settings: Settings, views: TrainingViews) -> Finder:
+        # Guesses are independent of each other: no view rendered for one may serve the next.
+        alone = replace(settings, rendering=replace(settings.rendering, reuse_angle_deg=0.0))
+        return PoseFinder(renderer, change(alone), views)
+
+    return Method(make, ablates=ablates)
+
+
+def _published(name: str, *, slow: bool = True, scale_known: bool = True, **config: Any) -> Method:
+    def make(renderer: RayRenderer, settings: Settings, views: TrainingViews) -> Finder:
+        kinds = benchmark("baselines")
+        if name == "essential":
+            return _Baseline(kinds.Essential(renderer, settings))
+        kind, its_config = {"inerf": (kinds.Inerf, kinds.InerfConfig), "pi-nerf": (kinds.PiNerf, kinds.PiNerfConfig)}[
+            name
+        ]
+        return _Baseline(kind(renderer, its_config(**config)))
+
+    return Method(make, slow, scale_known)
 
 
 def _one_step(settings: Settings) -> Settings:
@@ -22,16 +84,35 @@ def _unmined(settings: Settings) -> Settings:
     return _one_step(replace(settings, lifting=replace(settings.lifting, views=0)))
 
 
+def _refined_step(settings: Settings) -> Settings:
+    return replace(settings, tracking=replace(settings.tracking, passes=1))
+
+
 def _anywhere(settings: Settings) -> Settings:
-    return replace(settings, refinement=replace(settings.refinement, region="image"))
+    return _refined_step(replace(settings, refinement=replace(settings.refinement, region="image")))
 
 
-METHODS: dict[str, Change] = {
-    "one-step": _one_step,
-    "one-step-unmined": _unmined,
-    "passes": _passes,
-    "full": lambda settings: settings,
-    "full-anywhere": _anywhere,
+def _adam(settings: Settings) -> Settings:
+    return _refined_step(replace(settings, refinement=replace(settings.refinement, optimiser="adam", steps=40)))
+
+
+METHODS: dict[str, Method] = {
+    "one-step": _ours(_one_step),
+    "one-step-unmined": _ours(_unmined, ablates="one-step"),
+    "one-step-refined": _ours(_refined_step),
+    "one-step-refined-anywhere": _ours(_anywhere, ablates="one-step-refined"),
+    "one-step-refined-adam": _ours(_adam, ablates="one-step-refined"),
+    "passes": _ours(_passes),
+    "full": _ours(lambda settings: settings),
+    "essential": _published("essential", slow=False, scale_known=False),
+    "inerf": _published("inerf"),
+    "inerf-2048": _published("inerf", rays=2048),
+    "pi-nerf": _published("pi-nerf"),
+    "pi-nerf-published": _published("pi-nerf", turn_about="camera", loss="mape", angle_deg=15.0, shift=0.3),
 }
-"""one-step: a single pass; one-step-unmined: without discarding inconsistent points; passes: as many as
-tracking.passes says; full: those and refinement; full-anywhere: refinement on pixels of the whole image."""
+"""one-step: a single pass; -unmined: without discarding inconsistent points; -refined: and refinement by colours, on
+pixels around the keypoints or, -anywhere, of the whole image, -adam, by the paper's 40 steps of Adam; passes: up to
+tracking.passes of them, from other guesses where the first leads nowhere; full: those and refinement; the others: see
+tests/benchmark/baselines."""
+
+DEFAULT = ("one-step", "one-step-unmined", "passes", "full")

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from stages.geometry import perturb, rotation_error_deg, translation_error
+from stages.geometry import camera_centre, perturb, rotation_error_deg, translation_error
+
+TurnAbout = Literal["origin", "camera"]
 
 
 @dataclass(frozen=True)
 class Protocol:
     """`images` held-out images a seed, each with `poses` guesses: see stages.geometry.perturb.
 
-    Angles are in degrees, lengths in units of the dataset as its reader gives it; the camera is turned about the
-    origin of the dataset's coordinates.
+    Angles are in degrees, lengths in units of the dataset as its reader gives it. The camera is turned about the
+    origin of the dataset's coordinates or about itself. occluded: things are pasted over the images. in_turn: guesses
+    are turned or shifted, one after the other, and never both.
     """
 
     name: str
@@ -23,6 +27,9 @@ class Protocol:
     max_translation: float
     images: int = 5
     poses: int = 5
+    turn_about: TurnAbout = "origin"
+    occluded: bool = False
+    in_turn: bool = False
 
 
 PROTOCOLS = {
@@ -30,9 +37,12 @@ PROTOCOLS = {
     for protocol in (
         Protocol("nerf-synthetic", (10.0, 40.0), 0.2),
         Protocol("llff", (0.0, 40.0), 0.1),
+        Protocol("occluded", (0.0, 40.0), 0.1, occluded=True),
+        Protocol("reach", (0.0, 180.0), 1.0, poses=10, in_turn=True),
     )
 }
-"""The paper's section V-B, after iNeRF (Yen-Chen et al., 2021)."""
+"""The first three: the paper's sections V-B to V-D, after iNeRF (Yen-Chen et al., 2021). reach: any turn, or a shift by
+up to 1 (to be replaced by the object's diameter)."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +67,13 @@ def draw(protocol: Protocol, truths: Sequence[np.ndarray], seeds: Sequence[int])
         rng = np.random.default_rng(seed)
         for image in rng.permutation(len(truths))[: protocol.images]:
             truth = truths[image]
-            pairs += [
-                Pair(seed, int(image), truth, perturb(truth, rng, protocol.angle_deg, protocol.max_translation))
-                for _ in range(protocol.poses)
-            ]
+            pairs += [Pair(seed, int(image), truth, _guess(protocol, truth, rng, i)) for i in range(protocol.poses)]
     return pairs
+
+
+def _guess(protocol: Protocol, truth: np.ndarray, rng: np.random.Generator, index: int) -> np.ndarray:
+    angle_deg, shift = protocol.angle_deg, protocol.max_translation
+    if protocol.in_turn:
+        angle_deg, shift = ((0.0, 0.0), shift) if index % 2 else (angle_deg, 0.0)
+    centre = camera_centre(truth) if protocol.turn_about == "camera" else np.zeros(3)
+    return perturb(truth, rng, angle_deg, shift, centre)

@@ -1,4 +1,4 @@
-"""Success curves as a picture."""
+"""Pictures of an evaluation: success curves, how true the covariances are, how far methods reach."""
 
 from __future__ import annotations
 
@@ -7,23 +7,80 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from scipy.stats import chi2
 
-from deploy.evaluation.scores import Answer, curve
+from deploy.evaluation.scores import DIMENSIONS, Answer, curve
+
+Answers = Mapping[str, Sequence[Answer]]
+
+_BINS = 9
 
 
-def plot_success(answers: Mapping[str, Sequence[Answer]], path: Path, title: str) -> None:
-    """Share of pairs below each error, by method, rotation and translation side by side."""
+def plot_success(answers: Answers, path: Path, title: str) -> None:
+    """Share of pairs below each error, and share of true poses inside each ellipsoid, by method."""
+    drawing, axes = plt.subplots(1, 3, figsize=(14, 4), layout="constrained")
+    limits = (np.geomspace(0.01, 180, 200), np.geomspace(1e-4, 10, 200))
+    for which, (axis, label) in enumerate(zip(axes, ("rotation error, degrees", "translation error"), strict=False)):
+        for i, (name, given) in enumerate(answers.items()):
+            if which == 0 or all(answer.scale_known for answer in given):
+                axis.semilogx(limits[which], curve(given, which, limits[which]), label=name, color=f"C{i}")
+        _framed(axis, label, "share of pairs below")
+    _calibration(axes[2], answers)
+    axes[0].legend(loc="upper left", fontsize=8)
+    _save(drawing, path, title)
+
+
+def plot_reach(answers: Answers, path: Path, title: str, diameter: float) -> None:
+    """Share of right poses by how far the guess was turned, and by how far it was shifted in object diameters."""
     drawing, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    limits = (np.geomspace(0.01, 180, 200), np.geomspace(1e-4, 1, 200))
-    for which, (axis, label) in enumerate(zip(axes, ("rotation error, degrees", "translation error"), strict=True)):
+    for axis, which, end, unit in ((axes[0], 0, 180.0, 1.0), (axes[1], 1, 1.0, diameter)):
+        edges = np.linspace(0, end, _BINS + 1)
         for name, given in answers.items():
-            axis.semilogx(limits[which], curve(given, which, limits[which]), label=name)
-        axis.set_xlabel(label)
-        axis.set_ylabel("share of pairs below")
-        axis.set_ylim(0, 1.02)
-        axis.grid(visible=True, which="both", alpha=0.3)
-    axes[1].legend(loc="lower right")
+            middles, shares = _binned([a for a in given if _turned(a) == (which == 0)], which, edges, unit)
+            axis.plot(middles, shares, marker="o", markersize=4, label=name)
+    _framed(axes[0], "turn of the guess, degrees", "share of right poses")
+    _framed(axes[1], "shift of the guess, object diameters", "share of right poses")
+    axes[0].legend(loc="lower left", fontsize=8)
+    _save(drawing, path, title)
+
+
+def _turned(answer: Answer) -> bool:
+    return answer.pair.guess_error[0] > 1e-3
+
+
+def _binned(
+    answers: Sequence[Answer], which: int, edges: np.ndarray, unit: float
+) -> tuple[list[float], list[float]]:
+    """Middles of the bins that have any answers, and the shares of right ones."""
+    sizes = np.array([answer.pair.guess_error[which] / unit for answer in answers])
+    right = np.array([answer.right for answer in answers])
+    places = np.clip(np.digitize(sizes, edges) - 1, 0, len(edges) - 2)
+    bins = np.unique(places)
+    return [float(edges[i : i + 2].mean()) for i in bins], [float(right[places == i].mean()) for i in bins]
+
+
+def _calibration(axis: Axes, answers: Answers) -> None:
+    probabilities = np.linspace(0, 1, 101)
+    axis.plot([0, 1], [0, 1], color="black", linewidth=0.8, linestyle="--")
+    for i, (name, given) in enumerate(answers.items()):
+        squared = np.array([d for answer in given if (d := answer.mahalanobis_squared) is not None])
+        if len(squared):
+            inside = [(squared <= limit).mean() for limit in chi2.ppf(probabilities, DIMENSIONS)]
+            axis.plot(probabilities, inside, label=name, color=f"C{i}")
+    _framed(axis, "probability of the ellipsoid", "share of true poses inside")
+
+
+def _framed(axis: Axes, x_label: str, y_label: str) -> None:
+    axis.set_xlabel(x_label)
+    axis.set_ylabel(y_label)
+    axis.set_ylim(0, 1.02)
+    axis.grid(visible=True, alpha=0.3)
+
+
+def _save(drawing: Figure, path: Path, title: str) -> None:
     drawing.suptitle(title, fontsize=10)
     path.parent.mkdir(parents=True, exist_ok=True)
-    drawing.savefig(path, dpi=120)
+    drawing.savefig(path, dpi=110)
     plt.close(drawing)

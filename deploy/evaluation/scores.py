@@ -1,6 +1,7 @@
 """What answers are worth: errors, shares of success, and whether the stated covariance is true.
 
 The keys of a method's scores, which programs may rely on:
+  pairs              how many pairs it was given
   share_re_below_5deg, share_te_below_0.05  over all pairs; no pose is a failure
   share_both_below   over all pairs: both errors below their limits
   share_ok           pairs that got a pose
@@ -8,6 +9,9 @@ The keys of a method's scores, which programs may rely on:
   mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te   over the pairs with a pose; null without any
   seconds_per_image  mean, all passes and refinement included
   covariance         {50, 90, 99}: share of the true poses inside the ellipsoid of that probability; null without any
+  add                {diameter, add_below_0.1d, add_s_below_0.1d, auc_add, auc_add_s}: see deploy.evaluation.surface;
+                     null without a surface
+What speaks of translations is null for a method that cannot tell them.
 """
 
 from __future__ import annotations
@@ -20,28 +24,36 @@ import numpy as np
 from scipy.stats import chi2
 
 from deploy.evaluation.pairs import Pair
+from deploy.evaluation.surface import SHARE, Surface, add, add_s, area_under_curve
 from deploy.results import CLOSE, CLOSE_DEG
 from stages.geometry import inverse, log_se3, rotation_error_deg, translation_error
 
 _RESAMPLES = 2000
-_DIMENSIONS = 6
+DIMENSIONS = 6
 _PROBABILITIES = (50, 90, 99)
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A method's answer to a pair; the pose is None where it found none."""
+    """A method's answer to a pair; the pose is None where it found none, its translation nothing if not scale_known."""
 
     pair: Pair
     cam_from_object: np.ndarray | None
     covariance: np.ndarray | None
     seconds: float
+    scale_known: bool = True
 
     @property
     def errors(self) -> tuple[float, float] | None:
         """Rotation in degrees and translation; None without a pose."""
         pose, truth = self.cam_from_object, self.pair.truth
         return None if pose is None else (rotation_error_deg(pose, truth), translation_error(pose, truth))
+
+    @property
+    def right(self) -> bool:
+        """Whether there is a pose with both errors below their limits."""
+        errors = self.errors
+        return errors is not None and self.scale_known and errors[0] < CLOSE_DEG and errors[1] < CLOSE
 
     @property
     def mahalanobis_squared(self) -> float | None:
@@ -52,24 +64,33 @@ class Answer:
         return float(twist @ np.linalg.pinv(self.covariance) @ twist)
 
 
-def score(answers: Sequence[Answer]) -> dict[str, Any]:
+def score(answers: Sequence[Answer], surface: Surface | None = None) -> dict[str, Any]:
     """The scores of one method over its pairs."""
     errors = [answer.errors for answer in answers]
     found = np.array([error for error in errors if error is not None]).reshape(-1, 2)
     close = found < (CLOSE_DEG, CLOSE)
-    count = len(answers)
+    count, scale_known = len(answers), all(answer.scale_known for answer in answers)
     distances = [d for answer in answers if (d := answer.mahalanobis_squared) is not None]
     return {
+        "pairs": count,
         "share_re_below_5deg": float(close[:, 0].sum() / count),
-        "share_te_below_0.05": float(close[:, 1].sum() / count),
-        "share_both_below": float(close.all(axis=1).sum() / count),
+        "share_te_below_0.05": float(close[:, 1].sum() / count) if scale_known else None,
+        "share_both_below": float(close.all(axis=1).sum() / count) if scale_known else None,
         "share_ok": len(found) / count,
-        "share_ok_right": float(close.all(axis=1).mean()) if len(found) else None,
+        "share_ok_right": float(close.all(axis=1).mean()) if len(found) and scale_known else None,
         **_statistics("re_deg", found[:, 0]),
-        **_statistics("te", found[:, 1]),
+        **_statistics("te", found[:, 1] if scale_known else found[:0, 1]),
         "seconds_per_image": float(np.mean([answer.seconds for answer in answers])),
         "covariance": _coverage(distances),
+        "add": _surface_scores(answers, surface) if surface is not None and scale_known else None,
     }
+
+
+def share_of_solvable(answers: Sequence[Answer], others: Sequence[Sequence[Answer]]) -> float | None:
+    """Of the pairs that any method answered rightly, the share that these answers have right; None without any."""
+    solvable = {id(a.pair) for given in [answers, *others] for a in given if a.right}
+    asked = [answer for answer in answers if id(answer.pair) in solvable]
+    return float(np.mean([answer.right for answer in asked])) if asked else None
 
 
 def _statistics(name: str, values: np.ndarray) -> dict[str, float | None]:
@@ -86,28 +107,36 @@ def _coverage(distances: Sequence[float]) -> dict[str, float] | None:
     if not distances:
         return None
     squared = np.array(distances)
-    return {str(p): float((squared <= chi2.ppf(p / 100, _DIMENSIONS)).mean()) for p in _PROBABILITIES}
+    return {str(p): float((squared <= chi2.ppf(p / 100, DIMENSIONS)).mean()) for p in _PROBABILITIES}
+
+
+def _surface_scores(answers: Sequence[Answer], surface: Surface) -> dict[str, float]:
+    poses = [(answer.cam_from_object, answer.pair.truth) for answer in answers]
+    end = SHARE * surface.diameter
+    scores = {"diameter": surface.diameter}
+    for name, measure in (("add", add), ("add_s", add_s)):
+        errors = [np.inf if pose is None else measure(pose, truth, surface) for pose, truth in poses]
+        scores[f"{name}_below_{SHARE}d"] = float((np.array(errors) < end).mean())
+        scores[f"auc_{name}"] = area_under_curve(errors, end)
+    return scores
 
 
 def difference(first: Sequence[Answer], second: Sequence[Answer]) -> dict[str, Any]:
     """How much larger the first method's errors are, over the pairs that both answered: mean and its 95 % interval.
 
-    The interval is of the bootstrap over images' pairs, resampled together for both methods.
+    The interval is of the bootstrap over images' pairs, resampled together for both methods. Where one method was
+    given fewer pairs, they are the first of the other's.
     """
-    both = [(a.errors, b.errors) for a, b in zip(first, second, strict=True) if a.errors and b.errors]
+    both = [(a.errors, b.errors) for a, b in zip(first, second, strict=False) if a.errors and b.errors]
     if not both:
         return {"pairs": 0, "re_deg": None, "te": None}
     gaps = np.array([np.subtract(a, b) for a, b in both if a is not None and b is not None])
     places = np.random.default_rng(0).integers(0, len(gaps), (_RESAMPLES, len(gaps)))
     low, high = np.quantile(gaps[places].mean(axis=1), (0.025, 0.975), axis=0)
     mean = gaps.mean(axis=0)
-    return {
-        "pairs": len(gaps),
-        **{
-            name: {"mean": float(mean[i]), "low": float(low[i]), "high": float(high[i])}
-            for i, name in enumerate(("re_deg", "te"))
-        },
-    }
+    turn, shift = ({"mean": float(mean[i]), "low": float(low[i]), "high": float(high[i])} for i in (0, 1))
+    scale_known = all(answer.scale_known for answer in (*first, *second))
+    return {"pairs": len(gaps), "re_deg": turn, "te": shift if scale_known else None}
 
 
 def curve(answers: Sequence[Answer], which: int, limits: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ from stages.geometry.rigid import (
     rotation_about,
 )
 from stages.geometry.sampling import perturb
+from stages.geometry.uncertainty import twist_covariance
 
 __all__ = [
     "Camera",
@@ -32,4 +33,5 @@ __all__ = [
     "rotation_about",
     "rotation_error_deg",
     "translation_error",
+    "twist_covariance",
 ]

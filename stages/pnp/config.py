@@ -11,9 +11,9 @@ class PnpConfig:
 
     threshold_px: float = 3.0
     """largest reprojection error of an inlier where the image is 400 pixels long; it grows with the image"""
-    iterations: int = 4000
+    iterations: int = 5000
     """at most so many samples of three points"""
-    confidence: float = 0.999
+    confidence: float = 0.99999
     """RANSAC stops when a better pose would have been seen with this probability"""
     min_inliers: int = 8
     """fewer inliers are no pose"""
@@ -25,5 +25,9 @@ class PnpConfig:
     """a pose that its inliers leave less certain than this is none"""
     confidence_power: float = 2.0
     """squared errors are weighted by the matches' confidence to this power; 0: all the same"""
+    shared_error: float = 0.7
+    """how far neighbouring matches err together, as a multiple of how far each errs by itself"""
+    shared_error_by_angle: float = 0.6
+    """what is added to it for each radian between the directions of view, divided by the share of inliers"""
     seed: int = 0
     """of RANSAC's samples"""

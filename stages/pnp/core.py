@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.geometry import Camera
+from stages.geometry import Camera, camera_centre, twist_covariance
 from stages.geometry.rigid import from_rotation
 from stages.pnp.config import PnpConfig
 from stages.pnp.least_squares import PoseFit, fit_pose, reprojection
@@ -47,11 +47,13 @@ def solve(
     camera: Camera,
     config: PnpConfig | None = None,
     confidence: np.ndarray | None = None,
+    guess: np.ndarray | None = None,
 ) -> PnpResult:
     """The camera's pose from pixels (n, 2), distorted as the camera has them, and points (n, 3) in the object.
 
-    confidence (n,), relative to each other, counts in the refinement and not in RANSAC. The same input gives the
-    same result. Never raises for data that hold no pose: the result says why.
+    confidence (n,), relative to each other, counts in the refinement and not in RANSAC. guess (4, 4): the pose that
+    the points were seen from; the further it is from the pose found, the less certain is that. The same input gives
+    the same result. Never raises for data that hold no pose: the result says why.
     """
     config = config or PnpConfig()
     if len(pixels_in_frame) < max(config.min_inliers, _MIN_POINTS):
@@ -70,10 +72,14 @@ def solve(
     fit, inliers = _polish(pixels, points, plain, start, weights, threshold, config)
     if fit is None or inliers.sum() < config.min_inlier_ratio * len(pixels):
         return _failed("no_consensus", len(pixels))
-    if not _plausible(fit, pixels[inliers], max(camera.width, camera.height), config):
+    longer_side = max(camera.width, camera.height)
+    angle = 0.0 if guess is None else _angle_between_views(points[inliers], guess, fit.cam_from_object)
+    shared = config.shared_error + config.shared_error_by_angle * angle / inliers.mean()
+    covariance = twist_covariance(fit.jacobian, fit.weights, pixels[inliers], longer_side, fit.variance, shared)
+    if not _plausible(covariance, pixels[inliers], longer_side, config):
         return _failed("implausible_pose", len(pixels))
     rms = float(np.sqrt((fit.residuals_px**2).sum(axis=1).mean()))
-    return PnpResult(True, "ok", fit.cam_from_object, inliers, rms, fit.covariance)
+    return PnpResult(True, "ok", fit.cam_from_object, inliers, rms, covariance)
 
 
 def _failed(reason: str, count: int) -> PnpResult:
@@ -124,9 +130,16 @@ def _polish(
     return fit, inliers
 
 
-def _plausible(fit: PoseFit, inlier_pixels: np.ndarray, longer_side: int, config: PnpConfig) -> bool:
+def _angle_between_views(points: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
+    """The median angle in radians between the directions in which two poses (4, 4) see points (n, 3)."""
+    one, other = points - camera_centre(first), points - camera_centre(second)
+    cosine = (one * other).sum(axis=1) / np.linalg.norm(one, axis=1) / np.linalg.norm(other, axis=1)
+    return float(np.median(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def _plausible(covariance: np.ndarray, inlier_pixels: np.ndarray, longer_side: int, config: PnpConfig) -> bool:
     """Whether the inliers extend over the image and leave the pose certain."""
     spread = np.sqrt(max(np.linalg.eigvalsh(np.cov(inlier_pixels.T))[0], 0.0))
-    uncertainty = np.sqrt(max(np.linalg.eigvalsh(fit.covariance[3:, 3:])[-1], 0.0))
+    uncertainty = np.sqrt(max(np.linalg.eigvalsh(covariance[3:, 3:])[-1], 0.0))
     certain = np.isfinite(uncertainty) and np.rad2deg(uncertainty) <= config.max_rotation_std_deg
     return bool(certain and spread >= config.min_spread * longer_side)

@@ -1,4 +1,4 @@
-"""The pose that fits correspondences best once the wrong ones are gone, and how certain it is."""
+"""The pose that fits correspondences best once the wrong ones are gone."""
 
 from __future__ import annotations
 
@@ -17,11 +17,21 @@ _MEDIAN_TO_SIGMA = 1.1774
 
 @dataclass(frozen=True)
 class PoseFit:
-    """cam_from_object (4, 4), the covariance (6, 6) of its left twist, and residuals (n, 2) in pixels."""
+    """cam_from_object (4, 4), the residuals (n, 2) in pixels with derivatives (n, 2, 6), weights (n,)."""
 
     cam_from_object: np.ndarray
-    covariance: np.ndarray
     residuals_px: np.ndarray
+    jacobian: np.ndarray
+    weights: np.ndarray
+
+    @property
+    def variance(self) -> float:
+        """Of a residual of weight 1 as Huber's loss sees it; Huber, Robust Statistics (1981), section 7.6."""
+        length = _lengths(self.residuals_px, self.weights)
+        delta = _huber_width(self.residuals_px, self.weights)
+        freedom = max(2 * len(length) - 6, 1)
+        slope = np.where(length <= delta, 1.0, delta / (2 * np.maximum(length, 1e-12))).mean()
+        return float((np.minimum(length, delta) ** 2).sum() / freedom / slope**2)
 
 
 def fit_pose(
@@ -45,7 +55,7 @@ def fit_pose(
             damping *= 100
         if np.linalg.norm(step) < _CONVERGED:
             break
-    return PoseFit(pose, _covariance(residuals, jacobian, weights), residuals)
+    return PoseFit(pose, residuals, jacobian, weights)
 
 
 def reprojection(
@@ -89,13 +99,3 @@ def _huber_cost(residuals: np.ndarray, weights: np.ndarray, delta: float) -> flo
     length = _lengths(residuals, weights)
     return float(np.where(length <= delta, length**2, delta * (2 * length - delta)).sum())
 
-
-def _covariance(residuals: np.ndarray, jacobian: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Covariance of the minimum of Huber's loss, noise unknown; Huber, Robust Statistics (1981), section 7.6."""
-    length = _lengths(residuals, weights)
-    delta = _huber_width(residuals, weights)
-    pull = np.minimum(length, delta)
-    freedom = max(2 * len(length) - 6, 1)
-    slope = np.where(length <= delta, 1.0, delta / (2 * np.maximum(length, 1e-12))).mean()
-    hessian = (weights[:, None, None] * jacobian).reshape(-1, 6).T @ jacobian.reshape(-1, 6)
-    return (pull**2).sum() / freedom / slope**2 * np.linalg.pinv(hessian, hermitian=True)

@@ -31,8 +31,9 @@ class PnpNode(JoinedHandler):
         kept = np.array(given.kept)
         pixels = given.pixels_in_frame[kept]
         result = solve(
-            pixels, given.points_in_object[kept], camera_of(given.camera), self._config, given.confidence[kept]
-        )
+            pixels, given.points_in_object[kept], camera_of(given.camera), self._config, given.confidence[kept],
+            np.array(given.guess_cam_from_object),
+        )  # fmt: skip
         yield ESTIMATE, Estimate(
             header=reply_header(given.header),
             ok=result.ok,

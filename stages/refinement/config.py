@@ -38,3 +38,5 @@ class RefinementConfig:
     """Adam's, in radians and in shares of the distance to the surface"""
     converged: float = 2e-5
     """a step that is smaller, in the same unit, is the last"""
+    shared_error: float = 0.7
+    """how far neighbouring pixels err together, as a multiple of how far each errs by itself"""

@@ -25,7 +25,8 @@ _MIN_PIXELS = 64
 class RefinementResult:
     """The better of the pose before and after, and the held-out loss of both (None where nothing was tried).
 
-    Losses are robust, of colour differences in 0..1, on the same pixels with the same weights.
+    Losses are robust, of colour differences in 0..1, on the same pixels with the same weights. covariance: (6, 6) of
+    the left twist of a refined pose, None of one that was left as it was.
     """
 
     cam_from_object: np.ndarray
@@ -33,6 +34,7 @@ class RefinementResult:
     loss_before: float | None
     loss_after: float | None
     steps: int
+    covariance: np.ndarray | None = None
 
 
 def refine(
@@ -68,8 +70,10 @@ def refine(
     optimise = levenberg_marquardt if config.optimiser == "lm" else adam
     refined, steps = optimise(photometric, pool, cam_from_object, distance, rng, config)
     after = photometric.loss(judge, refined)
-    better = after < before
-    return RefinementResult(refined if better else cam_from_object, better, before, after, steps)
+    if after >= before:
+        return RefinementResult(cam_from_object, False, before, after, steps)
+    covariance = photometric.covariance(judge, refined, camera, config.shared_error)
+    return RefinementResult(refined, True, before, after, steps, covariance)
 
 
 def _shrunk(

@@ -42,7 +42,8 @@ class RefinementNode(JoinedHandler):
             )  # fmt: skip
         yield POSE, Pose(
             header=reply_header(estimate.header), ok=True, reason=Reason.OK, refined=result.refined,
-            cam_from_object=result.cam_from_object, covariance=estimate.covariance,
+            cam_from_object=result.cam_from_object,
+            covariance=estimate.covariance if result.covariance is None else result.covariance,
             inliers=len(estimate.inliers_in_frame), correspondences=estimate.correspondences,
             residual_px=estimate.residual_px, loss_before=result.loss_before, loss_after=result.loss_after,
         )  # fmt: skip

@@ -42,6 +42,8 @@ class ScoreConfig:
     """A pose that scores less is not used."""
     good: float = 0.4
     """What it takes to trust tracking again after it was limited or lost."""
+    sure: float = 0.7
+    """What it takes to believe the pose of an image that stands by itself before another pass has found it again."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,9 @@ class TrackingConfig:
     """Most passes over a frame whose guess may be far off: the pose found becomes the next guess."""
     retries: int = 1
     """How many other guesses to try on the same frame when one has led nowhere."""
+    searches: int = 40
+    """How many training views to try, nearest to the guess first, for an image that stands by itself and whose pose
+    was not found from its guess; none where there is only one pass."""
     seed: int = 0
     """Of the disturbed guesses."""
     max_deadline_ms: float = 10_000.0
@@ -103,7 +108,8 @@ class TrackingConfig:
     score: ScoreConfig = field(default_factory=ScoreConfig)
 
     def __post_init__(self) -> None:
-        for name, least in (("depth", 1), ("passes", 1), ("retries", 0), ("lost_after", 1), ("weak_after", 1)):
+        least_values = {"depth": 1, "passes": 1, "retries": 0, "searches": 0, "lost_after": 1, "weak_after": 1}
+        for name, least in least_values.items():
             if getattr(self, name) < least:
                 raise ConfigError(f"tracking: {name} is {getattr(self, name)}, but must be at least {least}")
         for part in (self, self.motion, self.score):

@@ -13,19 +13,26 @@ from stages.geometry import perturb
 from stages.tracking.config import TrackingConfig
 from stages.tracking.distance import Limit
 from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
-from stages.tracking.scoring import score
+from stages.tracking.scoring import believed, score
+from stages.tracking.views import TrainingViews, nearest_first
 
-_TRUTHS_KEPT = 256
+_FRAMES_KEPT = 256
 
 
 class EachFramePolicy:
-    """Frames with guesses of their own, by frame_id; each pass begins where the pass before ended."""
+    """Frames with guesses of their own, by frame_id; each pass begins where the pass before ended.
 
-    def __init__(self, config: TrackingConfig, scale: float, guesses: Mapping[int, np.ndarray]) -> None:
+    Where the guess leads to no pose that is believed, training views are tried in its place. A pose that is not
+    believed is none; with a single pass there is nothing to confirm it by, and every usable one counts.
+    """
+
+    def __init__(self, config: TrackingConfig, views: TrainingViews, guesses: Mapping[int, np.ndarray]) -> None:
         self._config = config
-        self._scale = scale
+        self._views = views
+        self._scale = views.scale
         self._guesses = guesses
-        self._settled = Limit(config.settled_deg, config.settled * scale)
+        self._settled = Limit(config.settled_deg, config.settled * self._scale)
+        self._others: OrderedDict[int, list[np.ndarray]] = OrderedDict()
 
     def on_truth(self, frame_id: int, cam_from_object: np.ndarray | None) -> None:
         """The guesses are given; the truth is not asked for."""
@@ -36,26 +43,49 @@ class EachFramePolicy:
         return None if guess is None else PoseGuess(GuessReason.PRIOR, guess)
 
     def next_guess(self, attempt: Attempt, result: PoseResult) -> PoseGuess | None:
-        """NEXT_PASS until the pose settles or the passes are used up; None after a failure."""
-        pose = result.cam_from_object if result.ok else None
-        if pose is None or attempt.passes >= self._config.passes:
+        """NEXT_PASS until the pose settles or the passes are used up; then RELOCALISATION unless it is believed."""
+        pose = result.cam_from_object if self._quality(result) >= self._config.score.usable else None
+        more = attempt.passes < self._config.passes
+        if more and pose is not None and not self._settled.holds(attempt.guess.cam_from_object, pose):
+            return PoseGuess(GuessReason.NEXT_PASS, pose)
+        if self._config.passes == 1 or self._believed(attempt, result) is not None:
             return None
-        settled = self._settled.holds(attempt.guess.cam_from_object, pose)
-        return None if settled else PoseGuess(GuessReason.NEXT_PASS, pose)
+        others = self._other_guesses(attempt.frame.frame_id)
+        return PoseGuess(GuessReason.RELOCALISATION, others[attempt.retries]) if attempt.retries < len(others) else None
 
     def conclude(self, attempt: Attempt, result: PoseResult) -> Belief:
-        """The newest pose that a pass has found; LIMITED where it scores too little to be used in tracking."""
-        found = result if result.ok else attempt.earlier
+        """The newest pose that is believed, TRACKING; LOST without one."""
+        self._others.pop(attempt.frame.frame_id, None)
+        found = self._believed(attempt, result)
         if found is None:
-            return Belief(TrackingState.LOST, 0.0)
-        quality = score(found, self._config.score, self._scale)
-        usable = quality >= self._config.score.usable
-        state = TrackingState.TRACKING if usable else TrackingState.LIMITED
-        return Belief(state, quality, found.cam_from_object, found.covariance)
+            return Belief(TrackingState.LOST, self._quality(result))
+        return Belief(TrackingState.TRACKING, self._quality(found), found.cam_from_object, found.covariance)
 
     def missed(self, frame: FrameInfo) -> Belief:
         """Nothing is known of a frame that did not come back."""
+        self._others.pop(frame.frame_id, None)
         return Belief(TrackingState.LOST, 0.0)
+
+    def _quality(self, result: PoseResult) -> float:
+        return score(result, self._config.score, self._scale)
+
+    def _believed(self, attempt: Attempt, result: PoseResult) -> PoseResult | None:
+        if self._config.passes == 1:
+            return result if self._quality(result) >= self._config.score.usable else None
+        if believed(result, attempt.guess.cam_from_object, self._config, self._scale):
+            return result
+        earlier = attempt.earlier
+        return earlier if earlier is not None and believed(earlier, None, self._config, self._scale) else None
+
+    def _other_guesses(self, frame_id: int) -> list[np.ndarray]:
+        """Training views in the order in which they are tried for a frame."""
+        if frame_id not in self._others:
+            cover = Limit(self._config.cover_deg, self._config.cover * self._scale)
+            order = nearest_first(self._views.cam_from_object, self._guesses[frame_id], cover)
+            self._others[frame_id] = [self._views.cam_from_object[i] for i in order[: self._config.searches]]
+            if len(self._others) > _FRAMES_KEPT:
+                self._others.popitem(last=False)
+        return self._others[frame_id]
 
 
 @dataclass(frozen=True)
@@ -72,9 +102,9 @@ class PerturbedTruthPolicy(EachFramePolicy):
     A frame's disturbance depends on the seed and its frame_id alone. A frame has no guess until its truth is known.
     """
 
-    def __init__(self, config: TrackingConfig, scale: float, disturbance: Disturbance) -> None:
+    def __init__(self, config: TrackingConfig, views: TrainingViews, disturbance: Disturbance) -> None:
         self._known: OrderedDict[int, np.ndarray] = OrderedDict()
-        super().__init__(config, scale, self._known)
+        super().__init__(config, views, self._known)
         self._disturbance = disturbance
 
     def on_truth(self, frame_id: int, cam_from_object: np.ndarray | None) -> None:
@@ -84,5 +114,5 @@ class PerturbedTruthPolicy(EachFramePolicy):
         rng = np.random.default_rng([self._config.seed, frame_id])
         disturbance = self._disturbance
         self._known[frame_id] = perturb(cam_from_object, rng, disturbance.angle_deg, disturbance.max_translation)
-        if len(self._known) > _TRUTHS_KEPT:
+        if len(self._known) > _FRAMES_KEPT:
             self._known.popitem(last=False)

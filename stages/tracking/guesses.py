@@ -34,12 +34,12 @@ def make_policy(config: TrackingConfig, views: TrainingViews) -> Policy:
     """The policy that `config.guess` asks for. Raises ConfigError."""
     spec = config.guess
     if spec is not None and spec.startswith("perturb:"):
-        return PerturbedTruthPolicy(config, views.scale, disturbance(spec))
+        return PerturbedTruthPolicy(config, views, disturbance(spec))
     if spec is None or spec.startswith("train:"):
         return TrackPolicy(config, views, None if spec is None else start_pose(spec, views))
     content = read_guess_file(Path(spec))
     if content.frames:
-        return EachFramePolicy(config, views.scale, content.frames)
+        return EachFramePolicy(config, views, content.frames)
     return TrackPolicy(config, views, content.start)
 
 

@@ -1,10 +1,11 @@
-"""How good a pose is, from what the solver says about it."""
+"""How good a pose is, from what the solver says about it, and whether it is to be believed."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from stages.tracking.config import ScoreConfig
+from stages.tracking.config import ScoreConfig, TrackingConfig
+from stages.tracking.distance import Limit
 from stages.tracking.policy import PoseResult
 
 
@@ -22,6 +23,19 @@ def score(result: PoseResult, config: ScoreConfig, scale: float = 1.0) -> float:
         sigma, sigma_deg = deviations(result.covariance)
         measures += [_share(config.good_sigma * scale, sigma), _share(config.good_sigma_deg, sigma_deg)]
     return float(np.clip(min(measures), 0.0, 1.0))
+
+
+def believed(result: PoseResult, guess: np.ndarray | None, config: TrackingConfig, scale: float = 1.0) -> bool:
+    """Whether the pose of an image that stands by itself is right beyond doubt.
+
+    It is if it scores high, or if a pass that began there (`guess`) has found it again; a wrong pose has few inliers
+    and does not lead to itself.
+    """
+    quality = score(result, config.score, scale)
+    if quality >= config.score.sure or result.cam_from_object is None:
+        return quality >= config.score.sure
+    settled = Limit(config.settled_deg, config.settled * scale)
+    return guess is not None and quality >= config.score.usable and settled.holds(guess, result.cam_from_object)
 
 
 def deviations(covariance: np.ndarray) -> tuple[float, float]:

@@ -60,6 +60,18 @@ def farthest_point_order(poses: np.ndarray, limit: Limit) -> list[int]:
     return chosen
 
 
+def nearest_first(poses: np.ndarray, guess: np.ndarray, limit: Limit) -> list[int]:
+    """Indices of poses (n, 4, 4) that lie apart from the guess and from each other, the nearest to the guess first."""
+    if len(poses) == 0:
+        return []
+    from_guess, among = pairwise(guess[None], poses, limit)[0], pairwise(poses, poses, limit)
+    chosen: list[int] = []
+    for i in np.argsort(from_guess, kind="stable"):
+        if from_guess[i] > 1.0 and (among[i, chosen] > 1.0).all():
+            chosen.append(int(i))
+    return chosen
+
+
 class Keyframes:
     """The newest good poses that lie apart from one another, at most `capacity`."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from deploy.cli import main
 from deploy.evaluation.pairs import PROTOCOLS, Pair, draw
-from deploy.evaluation.scores import Answer, curve, difference, score
+from deploy.evaluation.scores import Answer, curve, difference, score, share_of_solvable
 from deploy.scene import demo_file
 from stages.geometry import camera_centre, exp_se3, look_at, rotation_about
 
@@ -100,10 +101,77 @@ def test_methods_are_compared_on_the_demo_scene(tmp_path: Path, capsys: pytest.C
     assert written["methods"]["full"]["mean_re_deg"] < 0.5
     assert written["differences"]["full"]["pairs"] >= 1
     assert plot.read_bytes().startswith(b"\x89PNG")
-    assert "ok and right" in capsys.readouterr().out
+    assert "ok & right" in capsys.readouterr().out
+
+
+def test_what_any_method_solves_is_solvable() -> None:
+    pairs = [Pair(0, i, np.eye(4), np.eye(4)) for i in range(4)]
+
+    def given(*errors: float | None) -> list[Answer]:
+        return [replace(answer(error), pair=pair) for error, pair in zip(errors, pairs, strict=False)]
+
+    first, second = given(1, None, 20, 20), given(1, 2, 20)
+    assert share_of_solvable(first, [first, second]) == 0.5
+    assert share_of_solvable(second, [first, second]) == 1
+    assert share_of_solvable(given(50), [given(60)]) is None
+
+
+def test_translations_without_a_scale_are_left_out() -> None:
+    unscaled = [replace(answer(1, 3.0), scale_known=False), replace(answer(9, 0.0), scale_known=False)]
+    scores = score(unscaled)
+    assert scores["share_re_below_5deg"] == 0.5
+    assert scores["mean_re_deg"] == pytest.approx(5)
+    assert scores["mean_te"] is scores["share_te_below_0.05"] is scores["share_ok_right"] is None
+    gap = difference(unscaled, [answer(1), answer(1)])
+    assert gap["re_deg"]["mean"] == pytest.approx(4)
+    assert gap["te"] is None
+
+
+def test_reach_turns_or_shifts() -> None:
+    protocol = replace(PROTOCOLS["reach"], max_translation=2.0)
+    for i, pair in enumerate(draw(protocol, TRUTHS, (0,))):
+        turn, shift = pair.guess_error
+        assert (turn < 1e-5) == bool(i % 2)
+        assert turn <= 180
+        if i % 2:
+            assert shift <= 2.0
+
+
+def test_cameras_may_be_turned_about_themselves() -> None:
+    protocol = replace(PROTOCOLS["llff"], turn_about="camera")
+    for pair in draw(protocol, TRUTHS, (0,)):
+        assert pair.guess_error[1] <= 0.1 + 1e-9
+
+
+@pytest.mark.parametrize("protocol", ["occluded", "reach"])
+def test_the_other_protocols_run_too(protocol: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    field = demo_file("field.safetensors")
+    figures, plot = tmp_path / "scores.json", tmp_path / "plot.png"
+    arguments = ["evaluate", field, field.parent, "--protocol", protocol, "--method", "one-step", "--seeds", 0]
+    arguments += ["--images", 2, "--poses", 2, "--size", 200, "--json", figures, "--plot", plot, "--shift", 0.3]
+    assert main([str(argument) for argument in arguments]) == 0
+    written = json.loads(figures.read_text())
+    assert written["pairs"] == 4
+    assert written["protocol"]["max_translation"] == 0.3
+    assert (written["covered"] is not None) == (protocol == "occluded")
+    assert 0 <= written["methods"]["one-step"]["add"]["auc_add"] <= 1
+    assert plot.read_bytes().startswith(b"\x89PNG")
+    assert protocol in capsys.readouterr().out
+
+
+def test_published_methods_run_on_the_same_pairs(tmp_path: Path) -> None:
+    field = demo_file("field.safetensors")
+    figures = tmp_path / "scores.json"
+    arguments = ["evaluate", field, field.parent, "--method", "essential", "--method", "inerf", "--slow-pairs", 1]
+    arguments += ["--seeds", 0, "--images", 2, "--poses", 1, "--size", 160, "--json", figures]
+    assert main([str(argument) for argument in arguments]) == 0
+    methods = json.loads(figures.read_text())["methods"]
+    assert [methods[name]["pairs"] for name in ("essential", "inerf")] == [2, 1]
+    assert methods["essential"]["mean_te"] is None
+    assert methods["inerf"]["share_ok"] == 1
 
 
 def test_an_unknown_method_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     field = demo_file("field.safetensors")
     assert main(["evaluate", str(field), str(field.parent), "--method", "guessing"]) == 2
-    assert "method 'guessing': expected one of one-step," in capsys.readouterr().err
+    assert "method 'guessing': expected all, or one of one-step," in capsys.readouterr().err

@@ -18,7 +18,9 @@ from deploy.settings import Settings, changed
 from deploy.single import PoseFinder
 from stages.geometry import perturb, rotation_error_deg, translation_error
 from stages.nerf.datasets import load_dataset
+from stages.tracking.views import TrainingViews
 
+NO_VIEWS = TrainingViews((), np.zeros((0, 4, 4)))
 SETTINGS = changed(Settings(), {"matching": {"matcher": "sift"}, "refinement": {"steps": 0}}, "test")
 
 
@@ -31,7 +33,7 @@ def test_a_pose_is_found_over_several_passes(scene: AnalyticScene) -> None:
     truth, seen_by = viewpoint(), camera(240)
     image = scene.render_view(seen_by, truth).rgb
     guess = perturb(truth, np.random.default_rng(1), (8.0, 8.0), 0.1)
-    found = PoseFinder(scene, SETTINGS, scale=4.0).find(image, seen_by, guess)
+    found = PoseFinder(scene, SETTINGS, NO_VIEWS).find(image, seen_by, guess)
     assert found.reason is Reason.OK
     assert found.cam_from_object is not None
     assert found.passes >= 2
@@ -45,12 +47,12 @@ def test_each_way_to_fail_has_its_reason(scene: AnalyticScene) -> None:
     away = truth.copy()
     away[2, 3] = -50.0
     blank = np.full((120, 120, 3), 255, np.uint8)
-    finder = PoseFinder(scene, SETTINGS, scale=4.0)
+    finder = PoseFinder(scene, SETTINGS, NO_VIEWS)
     assert finder.find(blank, seen_by, away).reason is Reason.NOTHING_IN_VIEW
     assert finder.find(blank, seen_by, truth).reason is Reason.TOO_FEW_MATCHES
     strict = replace(SETTINGS, lifting=replace(SETTINGS.lifting, min_kept=10_000))
     image = scene.render_view(seen_by, truth).rgb
-    found = PoseFinder(scene, strict, scale=4.0).find(image, seen_by, truth)
+    found = PoseFinder(scene, strict, NO_VIEWS).find(image, seen_by, truth)
     assert found.reason is Reason.TOO_FEW_CONSISTENT_POINTS
     assert not found.ok
 

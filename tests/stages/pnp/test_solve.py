@@ -61,18 +61,39 @@ def test_the_same_input_gives_the_same_result() -> None:
     assert np.array_equal(first.inliers, second.inliers)
 
 
-@pytest.mark.parametrize("noise_px", [0.3, 1.2])
-def test_the_covariance_is_that_of_the_error(noise_px: float) -> None:
-    """xi^T C^-1 xi is chi-square with 6 degrees of freedom; the mean of 150 lies within 0.6 of 6 by 2 sigma."""
+@pytest.mark.parametrize(("noise_px", "shared"), [(0.3, 0.0), (1.2, 0.0), (0.6, 0.7), (0.6, 1.5)])
+def test_the_covariance_is_that_of_the_error(noise_px: float, shared: float) -> None:
+    """xi^T C^-1 xi is chi-square with 6 degrees of freedom; the mean of 150 lies within 0.6 of 6 by 2 sigma.
+
+    Shared errors count twice, in the residuals and by themselves, but for what the fit takes up: wider limits.
+    """
     distances = []
     for seed in range(150):
-        pixels, points, _ = problem(np.random.default_rng(seed), 80, 0.0, noise_px)
-        result = solve(pixels, points, CAMERA, PnpConfig(threshold_px=20.0))
+        rng = np.random.default_rng(seed)
+        pixels, points, _ = problem(rng, 80, 0.0, noise_px)
+        offsets = shared * noise_px * rng.normal(size=(8, 8, 2))
+        column, row = np.clip(pixels // 50, 0, 7).astype(int).T
+        pixels = pixels + offsets[row, column].astype(np.float32)
+        own = shared / np.hypot(1, shared)  # residuals tell the sum of both errors
+        result = solve(pixels, points, CAMERA, PnpConfig(threshold_px=20.0, shared_error=own))
         twist = log_se3(solved(result) @ inverse(POSE))
         assert result.covariance is not None
         distances.append(twist @ np.linalg.solve(result.covariance, twist))
-    assert 5.2 < np.mean(distances) < 7.0
-    assert stats.kstest(distances, stats.chi2(6).cdf).pvalue > 0.01
+    low, high = (3.0, 8.0) if shared else (5.2, 7.0)
+    assert low < np.mean(distances) < high
+    if not shared:
+        assert stats.kstest(distances, stats.chi2(6).cdf).pvalue > 0.01
+
+
+def test_a_pose_seen_from_afar_is_less_certain() -> None:
+    pixels, points, _ = problem(np.random.default_rng(2), 100, 0.2, 0.5)
+    elsewhere = look_at((3, 1, 2), (0, 0, 0), (0, 0, 1))
+    near, far = (solve(pixels, points, CAMERA, guess=guess) for guess in (POSE, elsewhere))
+    np.testing.assert_array_equal(solved(near), solved(far))
+    assert near.covariance is not None
+    assert far.covariance is not None
+    assert np.linalg.eigvalsh(far.covariance - near.covariance).min() > -1e-15
+    assert np.trace(far.covariance) > 1.5 * np.trace(near.covariance)
 
 
 def test_confidence_tells_precise_matches_from_coarse_ones() -> None:

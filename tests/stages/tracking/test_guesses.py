@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +17,9 @@ from stages.tracking.config import TrackingConfig
 from stages.tracking.distance import Limit, pairwise
 from stages.tracking.frame_policies import EachFramePolicy, PerturbedTruthPolicy
 from stages.tracking.guesses import make_policy, needs_truth, start_pose
-from stages.tracking.policy import Attempt, FrameInfo, PoseResult
+from stages.tracking.policy import Attempt, FrameInfo, PoseGuess, PoseResult
 from stages.tracking.track_policy import TrackPolicy
-from stages.tracking.views import Keyframes, Relocaliser, TrainingViews, farthest_point_order
+from stages.tracking.views import Keyframes, Relocaliser, TrainingViews, farthest_point_order, nearest_first
 
 VIEWS = ring_of_views()
 FRAME = FrameInfo(7, 0)
@@ -128,7 +129,7 @@ def test_a_frame_without_truth_or_out_of_view_has_no_guess() -> None:
 
 
 def each_frame(passes: int = 3) -> tuple[EachFramePolicy, Attempt]:
-    policy = EachFramePolicy(TrackingConfig(passes=passes), 4.0, {7: on_sphere(0, 30)})
+    policy = EachFramePolicy(TrackingConfig(passes=passes), VIEWS, {7: on_sphere(0, 30)})
     guess = policy.first_guess(FRAME)
     assert guess is not None
     return policy, Attempt(FRAME, guess, 0)
@@ -159,6 +160,68 @@ def test_a_single_frame_keeps_an_earlier_pose_when_its_last_pass_fails() -> None
     assert belief.cam_from_object is first.cam_from_object
     assert policy.conclude(attempt, result(None)).state is TrackingState.LOST
     assert policy.missed(FRAME).cam_from_object is None
+
+
+def test_other_views_are_tried_until_a_pose_is_believed() -> None:
+    policy, attempt = each_frame()
+    tried = []
+    while (guess := policy.next_guess(attempt, result(None, attempt.pass_index))) is not None and len(tried) < 5:
+        assert guess.reason is GuessReason.RELOCALISATION
+        tried.append(guess.cam_from_object)
+        attempt = attempt.again(guess, result(None, attempt.pass_index), 0)
+    distances = [rotation_error_deg(on_sphere(0, 30), pose) for pose in tried]
+    assert distances == sorted(distances)
+    assert all(any((pose == view).all() for view in VIEWS.cam_from_object) for pose in tried)
+    there = result(on_sphere(0, 31), attempt.pass_index)
+    assert policy.conclude(attempt, there).state is TrackingState.TRACKING
+
+
+def test_searching_ends_and_leaves_no_pose() -> None:
+    config = TrackingConfig(searches=2)
+    policy = EachFramePolicy(config, VIEWS, {7: on_sphere(0, 30)})
+    attempt = Attempt(FRAME, PoseGuess(GuessReason.PRIOR, on_sphere(0, 30)), 0)
+    for _ in range(2):
+        guess = policy.next_guess(attempt, result(None))
+        assert guess is not None
+        attempt = attempt.again(guess, result(None), 0)
+    assert policy.next_guess(attempt, result(None)) is None
+    assert policy.conclude(attempt, result(None)).cam_from_object is None
+
+
+def test_a_weak_pose_is_believed_once_a_pass_has_found_it_again() -> None:
+    policy, attempt = each_frame(passes=2)
+    weak = replace(result(on_sphere(20, 30)), inliers=14, correspondences=60)
+    guess = policy.next_guess(attempt, weak)
+    assert guess is not None
+    assert guess.reason is GuessReason.NEXT_PASS
+    attempt = attempt.again(guess, weak, 0)
+    found_again = replace(weak, cam_from_object=on_sphere(20.2, 30), pass_index=1)
+    assert policy.next_guess(attempt, found_again) is None
+    assert policy.conclude(attempt, found_again).cam_from_object is found_again.cam_from_object
+    elsewhere = replace(weak, cam_from_object=on_sphere(60, 30), pass_index=1)
+    assert policy.conclude(attempt, elsewhere).cam_from_object is None
+    again = policy.next_guess(attempt, elsewhere)
+    assert again is not None
+    assert again.reason is GuessReason.RELOCALISATION
+
+
+def test_a_single_pass_has_nothing_to_confirm_it() -> None:
+    policy, attempt = each_frame(passes=1)
+    weak = replace(result(on_sphere(20, 30)), inliers=14, correspondences=60)
+    assert policy.next_guess(attempt, weak) is None
+    assert policy.conclude(attempt, weak).cam_from_object is weak.cam_from_object
+    assert policy.next_guess(attempt, result(None)) is None
+
+
+def test_nearest_first_lie_apart_from_the_guess_and_each_other() -> None:
+    limit, guess = Limit(25.0, 2.0), on_sphere(3, 32)
+    order = nearest_first(VIEWS.cam_from_object, guess, limit)
+    distances = pairwise(guess[None], VIEWS.cam_from_object, limit)[0]
+    assert list(distances[order]) == sorted(distances[order])
+    chosen = np.concatenate([guess[None], VIEWS.cam_from_object[order]])
+    assert (pairwise(chosen, chosen, limit) + 9 * np.eye(len(chosen))).min() > 1.0
+    assert pairwise(VIEWS.cam_from_object, chosen, limit).min(axis=1).max() <= 1.0
+    assert nearest_first(np.zeros((0, 4, 4)), guess, limit) == []
 
 
 def test_farthest_points_cover_all_views_and_are_spread() -> None:

@@ -1,0 +1,56 @@
+"""Things pasted over images cover what is wanted, and nothing else changes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.posed_images import centred, write_blender
+
+from deploy.evaluation.occlusion import Occlusion, objects_of, occluded, painted
+from deploy.scene import demo_file
+from stages.errors import DatasetError
+from stages.nerf.datasets import load_dataset
+
+GREY = np.full((120, 160, 3), 99, np.uint8)
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(0.05, 0.5))
+def test_what_is_not_covered_stays_as_it_was(seed: int, share: float) -> None:
+    wanted = Occlusion(covered=(share, share))
+    image, hidden = occluded(GREY, np.random.default_rng(seed), painted, wanted)
+    again, _ = occluded(GREY, np.random.default_rng(seed), painted, wanted)
+    np.testing.assert_array_equal(image, again)
+    assert image.dtype == np.uint8
+    changed = (image != GREY).any(axis=2)
+    assert hidden.any()
+    assert changed[hidden].mean() > 0.9
+    assert (changed & ~hidden).mean() < 0.05  # the half-transparent rim
+
+
+def test_at_least_the_wanted_share_is_covered() -> None:
+    shares = [occluded(GREY, np.random.default_rng(i), painted, Occlusion((0.3, 0.3)))[1].mean() for i in range(20)]
+    assert min(shares) > 0.25
+    assert np.mean(shares) < 0.6
+
+
+def test_objects_are_cut_out_of_a_dataset(tmp_path: Path) -> None:
+    write_blender(tmp_path, centred(40, 40, 50.0))
+    dataset = load_dataset(tmp_path, "test")
+    thing = objects_of(dataset)(np.random.default_rng(0))
+    assert thing.shape[2] == 4
+    assert thing[[0, -1], :, 3].any(axis=1).all()
+    assert thing[:, [0, -1], 3].any(axis=0).all()
+    image, hidden = occluded(GREY, np.random.default_rng(1), objects_of(dataset))
+    assert hidden.any()
+    assert (image[hidden] != 99).any()
+
+
+def test_a_dataset_without_transparency_has_nothing_to_cut_out() -> None:
+    dataset = load_dataset(demo_file("transforms_test.json").parent, "test")
+    with pytest.raises(DatasetError, match="cut out by their transparency"):
+        objects_of(dataset)

@@ -1,0 +1,48 @@
+"""Covariances with shared errors, against the covariance of every measurement written out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.geometry import twist_covariance
+
+
+def written_out(
+    jacobian: np.ndarray, weights: np.ndarray, pixels: np.ndarray, side: int, variance: float, shared: float
+) -> np.ndarray:
+    """(J^T W J)^-1 J^T W S W J (J^T W J)^-1 with the full covariance S of all residuals."""
+    n, k = jacobian.shape[:2]
+    flat, w = jacobian.reshape(n * k, 6), np.repeat(weights, k)
+    errors = np.diag(variance / w)
+    for i in range(n):
+        for j in range(n):
+            if tuple(pixels[i] // (side / 8)) == tuple(pixels[j] // (side / 8)):
+                errors[i * k : (i + 1) * k, j * k : (j + 1) * k] += np.eye(k) * variance * shared**2 / weights.mean()
+    gain = np.linalg.inv(flat.T @ (w[:, None] * flat)) @ (flat.T * w)
+    return gain @ errors @ gain.T
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(8, 40), st.integers(1, 3), st.floats(0, 3))
+def test_it_is_the_covariance_of_the_weighted_fit(seed: int, count: int, k: int, shared: float) -> None:
+    rng = np.random.default_rng(seed)
+    jacobian, weights = rng.normal(size=(count, k, 6)), rng.uniform(0.2, 2.0, count)
+    pixels = rng.uniform(0, 400, (count, 2))
+    arguments = (jacobian, weights, pixels, 400, 0.7, shared)
+    expected = written_out(*arguments)
+    np.testing.assert_allclose(twist_covariance(*arguments), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+
+
+def test_more_of_the_same_cell_tells_no_more_than_the_cell() -> None:
+    rng = np.random.default_rng(0)
+    few, places = rng.normal(size=(30, 2, 6)), rng.uniform(0, 400, (30, 2))
+    many, more_places = np.repeat(few, 200, axis=0), np.repeat(places, 200, axis=0)
+    sparse = twist_covariance(few, np.ones(30), places, 400, 1.0, 1.0)
+    dense = twist_covariance(many, np.ones(6000), more_places, 400, 1.0, 1.0)
+    alone = twist_covariance(many, np.ones(6000), more_places, 400, 1.0, 0.0)
+    assert np.trace(alone) == pytest.approx(np.trace(twist_covariance(few, np.ones(30), places, 400, 1.0, 0.0)) / 200)
+    assert 0.3 * np.trace(sparse) < np.trace(dense) < np.trace(sparse)
+

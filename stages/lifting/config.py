@@ -14,8 +14,12 @@ class LiftingConfig:
     """nearby views from which each point is seen again; 0 turns the test off"""
     angle_deg: float = 3.0
     """how far around the point a nearby view is"""
-    gamma: float = 4.0
+    gamma: float = 1.0
     """points whose root mean square displacement exceeds it are discarded; the unit is that of gamma_unit"""
+    enough: int = 150
+    """where fewer points are so consistent, the most consistent ones are kept up to this number"""
+    gamma_most: float = 8.0
+    """but none whose displacement exceeds this multiple of gamma"""
     gamma_unit: Literal["pixel", "field"] = "pixel"
     """pixel: what one pixel of the view covers at the point's depth; field: the field's own length unit"""
     min_opacity: float = 0.5

@@ -57,7 +57,16 @@ def lift(
     if seen.any():
         spread[seen] = consistency(renderer, points[seen], origins[0], rng, config)
     unit = 1.0 if config.gamma_unit == "field" else depths / camera.fx
-    return Lifted(points, spread, seen & (np.sqrt(spread) <= config.gamma * unit))
+    displacement = np.where(seen, np.sqrt(spread) / np.maximum(config.gamma * unit, 1e-12), np.inf)
+    return Lifted(points, spread, _consistent(displacement, config))
+
+
+def _consistent(displacement: np.ndarray, config: LiftingConfig) -> np.ndarray:
+    """Which points (n,) to keep by their displacement, in multiples of gamma."""
+    ranked = np.sort(displacement)
+    last = min(config.enough, len(ranked)) - 1
+    enough = ranked[last] if last >= 0 else 0.0
+    return displacement <= np.clip(enough, 1.0, max(config.gamma_most, 1.0))
 
 
 def depth_at(depth: np.ndarray, pixels: np.ndarray, max_step: float) -> np.ndarray:

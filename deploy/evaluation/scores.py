@@ -28,6 +28,7 @@ from deploy.evaluation.surface import SHARE, Surface, add, add_s, area_under_cur
 from deploy.results import CLOSE, CLOSE_DEG
 from stages.geometry import inverse, log_se3, rotation_error_deg, translation_error
 
+CAP_DEG, CAP = 4 * CLOSE_DEG, 4 * CLOSE
 _RESAMPLES = 2000
 DIMENSIONS = 6
 _PROBABILITIES = (50, 90, 99)
@@ -122,21 +123,37 @@ def _surface_scores(answers: Sequence[Answer], surface: Surface) -> dict[str, fl
 
 
 def difference(first: Sequence[Answer], second: Sequence[Answer]) -> dict[str, Any]:
-    """How much larger the first method's errors are, over the pairs that both answered: mean and its 95 % interval.
+    """How much larger the first method's errors are, pair by pair: mean and its 95 % interval, by the bootstrap.
 
-    The interval is of the bootstrap over images' pairs, resampled together for both methods. Where one method was
-    given fewer pairs, they are the first of the other's.
+    re_deg and te are over the pairs that both answered. capped_re_deg and capped_te are over all pairs, with errors of
+    at most CAP_DEG and CAP, which a missing pose has too: a few lost poses do not drown the rest. Where one method was
+    given fewer pairs, they are the first of the other's. te is null where a method cannot tell translations.
     """
-    both = [(a.errors, b.errors) for a, b in zip(first, second, strict=False) if a.errors and b.errors]
-    if not both:
-        return {"pairs": 0, "re_deg": None, "te": None}
-    gaps = np.array([np.subtract(a, b) for a, b in both if a is not None and b is not None])
+    asked = list(zip(first, second, strict=False))
+    both = [(a.errors, b.errors) for a, b in asked if a.errors and b.errors]
+    gaps = [np.subtract(a, b) for a, b in both if a is not None and b is not None]
+    capped = [np.subtract(_capped(a), _capped(b)) for a, b in asked]
+    scale_known = all(answer.scale_known for answer in (*first, *second))
+    figures: dict[str, Any] = {"pairs": len(gaps)}
+    for prefix, values in (("", gaps), ("capped_", capped)):
+        turn, shift = _interval(np.array(values))
+        figures |= {f"{prefix}re_deg": turn, f"{prefix}te": shift if scale_known else None}
+    return figures
+
+
+def _capped(answer: Answer) -> tuple[float, float]:
+    turn, shift = answer.errors or (CAP_DEG, CAP)
+    return min(turn, CAP_DEG), min(shift, CAP)
+
+
+def _interval(gaps: np.ndarray) -> list[dict[str, float] | None]:
+    """{mean, low, high} of each column; None without rows."""
+    if len(gaps) == 0:
+        return [None, None]
     places = np.random.default_rng(0).integers(0, len(gaps), (_RESAMPLES, len(gaps)))
     low, high = np.quantile(gaps[places].mean(axis=1), (0.025, 0.975), axis=0)
     mean = gaps.mean(axis=0)
-    turn, shift = ({"mean": float(mean[i]), "low": float(low[i]), "high": float(high[i])} for i in (0, 1))
-    scale_known = all(answer.scale_known for answer in (*first, *second))
-    return {"pairs": len(gaps), "re_deg": turn, "te": shift if scale_known else None}
+    return [{"mean": float(mean[i]), "low": float(low[i]), "high": float(high[i])} for i in (0, 1)]
 
 
 def curve(answers: Sequence[Answer], which: int, limits: np.ndarray) -> np.ndarray:

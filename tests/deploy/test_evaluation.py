@@ -83,6 +83,14 @@ def test_differences_are_taken_pair_by_pair() -> None:
     assert difference([answer(None)], [answer(1)])["pairs"] == 0
 
 
+def test_a_missing_pose_counts_as_far_off_where_errors_are_capped() -> None:
+    first = [answer(None), answer(170, 9.0), answer(3, 0.1)]
+    gap = difference(first, [answer(2, 0.05), answer(30, 1.0), answer(1, 0.1)])
+    assert gap["pairs"] == 2
+    assert gap["capped_re_deg"]["mean"] == pytest.approx((18 + 0 + 2) / 3)
+    assert gap["capped_te"]["mean"] == pytest.approx((0.15 + 0 + 0) / 3)
+
+
 def test_success_curves_count_missing_poses_as_failures() -> None:
     answers = [answer(1), answer(3), answer(None), answer(20)]
     np.testing.assert_allclose(curve(answers, 0, np.array([0.5, 2, 5, 180])), [0, 0.25, 0.5, 0.75])

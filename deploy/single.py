@@ -29,7 +29,7 @@ _FRAME = FrameInfo(frame_id=0, capture_ns=0)
 
 @dataclass
 class PoseFound:
-    """The answer for one image: `reason` says why there is no pose; stage_ms is of the last pass."""
+    """The answer for one image: `reason` says why there is no pose; stage_ms is of the pass that counts."""
 
     reason: Reason
     cam_from_object: np.ndarray | None = None
@@ -59,31 +59,34 @@ class PoseFinder:
         self._renderer, self._settings, self._training_views = renderer, settings, views
         self._views = ViewSource(renderer, settings.rendering)
         self._matcher = PairMatcher(build_matcher(settings.matching), settings.matching)
+        self._images = 0
 
     def find(self, image: np.ndarray, camera: Camera, guess: np.ndarray) -> PoseFound:
         """The pose of an image (h, w, 3) uint8 from a guessed cam_from_object (4, 4); see EachFramePolicy."""
         policy = EachFramePolicy(self._settings.tracking, self._training_views, {_FRAME.frame_id: guess})
         rng = np.random.default_rng(self._settings.tracking.seed)
         attempt = Attempt(_FRAME, PoseGuess(GuessReason.PRIOR, guess), sent_ns=0)
-        tried: list[PoseFound] = []
-        while True:
-            tried.append(self.one_pass(image, camera, attempt.guess.cam_from_object, rng))
+        further, tried = policy.first_guess(_FRAME), list[PoseFound]()
+        self._images += 1
+        while further is not None:
+            tried.append(self._one_pass(image, camera, further, rng))
             result = _result(tried[-1], attempt.pass_index)
             further = policy.next_guess(attempt, result)
-            if further is None:
-                break
-            attempt = attempt.again(further, result, now_ns=0)
+            if further is not None:
+                attempt = attempt.again(further, now_ns=0)
         return _concluded(tried, policy.conclude(attempt, result))
 
-    def one_pass(self, image: np.ndarray, camera: Camera, guess: np.ndarray, rng: np.random.Generator) -> PoseFound:
+    def _one_pass(
+        self, image: np.ndarray, camera: Camera, guess: PoseGuess, rng: np.random.Generator
+    ) -> PoseFound:
         """One way through the stages."""
-        clock = _Clock()
-        sourced = clock.time("rendering", lambda: self._views.view(camera, guess))
+        clock, next_pass = _Clock(), guess.reason is GuessReason.NEXT_PASS
+        sourced = clock.time("rendering", lambda: self._views.view(camera, guess.cam_from_object, next_pass))
         if sourced.visible < self._settings.rendering.min_visible:
             return PoseFound(Reason.NOTHING_IN_VIEW, stage_ms=clock.ms)
         view = sourced.view
         matched = clock.time(
-            "matching", lambda: self._matcher.match(view.rgb, view.opacity, image, sourced.view_id, id(image))
+            "matching", lambda: self._matcher.match(view.rgb, view.opacity, image, sourced.view_id, self._images)
         )
         if len(matched.confidence) < self._settings.matching.min_matches:
             return PoseFound(Reason.TOO_FEW_MATCHES, stage_ms=clock.ms)
@@ -92,7 +95,8 @@ class PoseFinder:
         if kept.sum() < self._settings.lifting.min_kept:
             return PoseFound(Reason.TOO_FEW_CONSISTENT_POINTS, stage_ms=clock.ms)
         pixels, points, confidence = matched.pixels_b[kept], lifted.points_in_object[kept], matched.confidence[kept]
-        solved = clock.time("pnp", lambda: solve(pixels, points, camera, self._settings.pnp, confidence, guess))
+        seen_from = view.cam_from_object
+        solved = clock.time("pnp", lambda: solve(pixels, points, camera, self._settings.pnp, confidence, seen_from))
         if solved.cam_from_object is None:
             return PoseFound(Reason(solved.reason), correspondences=len(pixels), stage_ms=clock.ms)
         pose = solved.cam_from_object
@@ -118,13 +122,13 @@ def _result(found: PoseFound, pass_index: int) -> PoseResult:
 
 
 def _concluded(tried: Sequence[PoseFound], belief: Belief) -> PoseFound:
-    """The one of the passes' results that is believed, else why there is none."""
-    last = tried[-1]
+    """The one of the passes' results that is believed, else why the first guess has led to none."""
+    first = tried[0]
     for found in reversed(tried):
         if found.ok and found.cam_from_object is belief.cam_from_object:
             return replace(found, passes=len(tried))
-    reason = Reason.IMPLAUSIBLE_POSE if last.ok else last.reason
-    return PoseFound(reason, correspondences=last.correspondences, passes=len(tried), stage_ms=last.stage_ms)
+    reason = Reason.IMPLAUSIBLE_POSE if first.ok else first.reason
+    return PoseFound(reason, correspondences=first.correspondences, passes=len(tried), stage_ms=first.stage_ms)
 
 
 class _Clock:

@@ -35,9 +35,10 @@ class Options:
     Example: fieldpose evaluate out/lego.safetensors ../shared/data/lego --method one-step --method full
 
     nerf-synthetic: 5 images, 5 guesses each, turned by 10 to 40 degrees about the origin and shifted by up to 0.2;
-    llff: up to 40 degrees and 0.1; occluded: the same, with things pasted over a part of the image; reach: by turns
-    turned by up to 180 degrees and shifted by up to the object's diameter. The same seed gives the same pairs for
-    every method. The JSON file has: protocol, unit, pairs, seeds, covered, diameter, methods (name -> pairs,
+    llff: up to 40 degrees and 0.1; occluded: the same, with things pasted over a part of the image; reach: alternately
+    turned by up to 180 degrees or shifted by up to the object's diameter. The same seed gives the same pairs for
+    every method. The JSON file has (it is written after each method): protocol, unit, pairs, seeds, covered,
+    diameter, methods (name -> pairs,
     share_re_below_5deg, share_te_below_0.05, share_both_below, share_ok, share_ok_right, share_of_solvable,
     mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te, seconds_per_image, covariance, add),
     differences (name -> than, and the mean and 95 % interval of how much larger its errors are than that method's,
@@ -51,7 +52,7 @@ class Options:
     protocol: Literal["nerf-synthetic", "llff", "occluded", "reach"] = "nerf-synthetic"
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """one-step, one-step-unmined, passes and full are the default; also one-step-refined, with -anywhere or -adam,
-    and the published inerf, inerf-2048, pi-nerf, pi-nerf-published, essential; may be given several times, or all."""
+    and the published inerf, inerf-2048, pi-nerf, pi-nerf-camera, essential; may be given several times, or all."""
     seeds: tuple[int, ...] = (0, 1, 2, 3)
     images: int = 5
     """Held-out images a seed."""
@@ -69,7 +70,7 @@ class Options:
     surface: Path | None = None
     """Points (n, 3) of the object's surface (.npy) for the ADD scores; taken from the field where none are given."""
     slow_pairs: int = 25
-    """Give methods that take seconds an image only the first so many pairs; 0: all."""
+    """Give methods that take seconds an image only so many of the pairs, evenly spread; 0: all."""
     size: int = 400
     """Shrink images whose longer side has more pixels."""
     json: Path | None = None
@@ -85,9 +86,10 @@ class Options:
         from deploy.evaluation import pairs
         from stages.nerf.datasets import load_dataset
         from stages.nerf.field import load_field
-        from stages.nerf.loading import make_renderer
+        from stages.nerf.loading import make_renderer, warm_up
 
         check_writable(self.json, self.plot)
+        self._check()
         names = self._methods()
         field = load_field(self.field)
         renderer = make_renderer(field, threads=0)
@@ -95,25 +97,45 @@ class Options:
         protocol = self._protocol(surface)
         drawn = pairs.draw(protocol, [record.cam_from_object for record in dataset.images], self.seeds)
         images, covered = self._images(dataset, drawn, protocol)
-        answers = {name: list(self._answers(name, field, renderer, dataset, images, drawn)) for name in names}
-        figures = {
+        warm_up(renderer, jacobian=True)
+        about = {
             "protocol": dataclasses.asdict(protocol),
             "unit": dataset.unit,
             "pairs": len(drawn),
             "seeds": list(self.seeds),
             "covered": covered,
             "diameter": None if surface is None else surface.diameter,
-            **_scores(answers, surface),
         }
-        write_json(self.json, figures)
+        answers: dict[str, Sequence[Answer]] = {}
+        for name in names:
+            answers[name] = list(self._answers(name, field, renderer, dataset, images, drawn))
+            figures = {**about, **_scores(answers, surface)}
+            write_json(self.json, figures)
         self._draw(answers, surface)
         _print(figures)
+        _warn_of_training_images(field, dataset)
         return 0
+
+    def _check(self) -> None:
+        """Raises UsageError for numbers that mean nothing, and for flags that would do nothing."""
+        if self.images < 1 or self.poses < 0 or self.slow_pairs < 0 or not self.seeds or min(self.seeds) < 0:
+            raise UsageError(
+                "--images must be at least 1, --poses and --slow-pairs at least 0, --seeds one or more from 0 on"
+            )
+        if self.shift is not None and not 0 <= self.shift < float("inf"):
+            raise UsageError(f"--shift {self.shift}: expected a length of 0 or more")
+        least, most = self.angle_deg or (0, 0)
+        if not 0 <= least <= most <= 180:
+            raise UsageError(f"--angle-deg {least:g} {most:g}: expected 0 <= least <= most <= 180")
+        if self.occluders is not None and self.protocol != "occluded":
+            raise UsageError(f"--occluders does nothing with --protocol {self.protocol}; use --protocol occluded")
+        if self.plot is not None and self.plot.suffix != ".png":
+            raise UsageError(f"--plot {self.plot}: expected a name that ends with .png")
 
     def _methods(self) -> Sequence[str]:
         from deploy.evaluation.methods import DEFAULT, METHODS
 
-        if self.method == ("all",):
+        if "all" in self.method:
             return tuple(METHODS)
         unknown = [name for name in self.method if name not in METHODS]
         if unknown:
@@ -127,7 +149,7 @@ class Options:
         shift = protocol.max_translation if self.shift is None else self.shift
         if protocol.in_turn and self.shift is None:
             if surface is None:
-                raise UsageError("reach: this field has no bounds, so that shifts have no measure; give --shift")
+                raise UsageError("reach: shifts are shares of the object's diameter, which is not known; give --shift")
             shift = surface.diameter
         return dataclasses.replace(
             protocol, images=self.images, poses=self.poses or protocol.poses, turn_about=self.turn_about,
@@ -175,12 +197,13 @@ class Options:
 
         method = METHODS[name]
         finder: Finder = method.make(renderer, self.settings, training_views(field.metadata))
-        if method.slow and self.slow_pairs:
-            drawn = drawn[: self.slow_pairs]
-        for i, pair in enumerate(track(drawn, description=name, console=progress_console())):
+        if method.slow and 0 < self.slow_pairs < len(drawn):
+            drawn = [drawn[i * len(drawn) // self.slow_pairs] for i in range(self.slow_pairs)]
+        if not method.slow:  # networks are slow the first time
+            last = drawn[-1]
+            finder.find(images[last.seed, last.image], dataset.images[last.image].camera, last.guess)
+        for pair in track(drawn, description=name, console=progress_console()):
             image, camera = images[pair.seed, pair.image], dataset.images[pair.image].camera
-            if i == 0 and not method.slow:
-                finder.find(image, camera, pair.guess)  # networks and kernels are slow the first time
             began = time.perf_counter()
             found = finder.find(image, camera, pair.guess)
             seconds = time.perf_counter() - began
@@ -194,9 +217,15 @@ class Options:
         count = max(len(given) for given in answers.values())
         title = f"{self.field.name}, {self.protocol}, {count} pairs"
         if self.protocol == "reach":
-            plot_reach(answers, self.plot, title, self.shift or (surface.diameter if surface else 1.0))
+            plot_reach(answers, self.plot, title, None if surface is None else surface.diameter)
         else:
             plot_success(answers, self.plot, title)
+
+
+def _warn_of_training_images(field: Field, dataset: Dataset) -> None:
+    known = {camera.name for camera in field.metadata.cameras} & {record.name for record in dataset.images}
+    if known:
+        print(f"warning: the field was trained on {len(known)} of these images; these are no held-out figures")
 
 
 def _scores(answers: Mapping[str, Sequence[Answer]], surface: Surface | None) -> dict[str, Any]:

@@ -61,13 +61,7 @@ def _ours(change: Callable[[Settings], Settings], ablates: str | None = None) ->
 
 def _published(name: str, *, slow: bool = True, scale_known: bool = True, **config: Any) -> Method:
     def make(renderer: RayRenderer, settings: Settings, views: TrainingViews) -> Finder:
-        kinds = benchmark("baselines")
-        if name == "essential":
-            return _Baseline(kinds.Essential(renderer, settings))
-        kind, its_config = {"inerf": (kinds.Inerf, kinds.InerfConfig), "pi-nerf": (kinds.PiNerf, kinds.PiNerfConfig)}[
-            name
-        ]
-        return _Baseline(kind(renderer, its_config(**config)))
+        return _Baseline(benchmark("baselines").BASELINES[name](renderer, settings, **config))
 
     return Method(make, slow, scale_known)
 
@@ -108,11 +102,12 @@ METHODS: dict[str, Method] = {
     "inerf": _published("inerf"),
     "inerf-2048": _published("inerf", rays=2048),
     "pi-nerf": _published("pi-nerf"),
-    "pi-nerf-published": _published("pi-nerf", turn_about="camera", loss="mape", angle_deg=15.0, shift=0.3),
+    "pi-nerf-camera": _published("pi-nerf", turn_about="camera", loss="mape", angle_deg=15.0, shift=0.3),
 }
 """one-step: a single pass; -unmined: without discarding inconsistent points; -refined: and refinement by colours, on
 pixels around the keypoints or, -anywhere, of the whole image, -adam, by the paper's 40 steps of Adam; passes: up to
-tracking.passes of them, from other guesses where the first leads nowhere; full: those and refinement; the others: see
-tests/benchmark/baselines."""
+tracking.passes of them, from other guesses where the first leads nowhere; full: those and refinement. essential:
+rotations from matches alone; inerf, -2048: with so many rays a step; pi-nerf, -camera: turned about the camera and
+drawn less widely, as published; these five are in tests/benchmark/baselines."""
 
 DEFAULT = ("one-step", "one-step-unmined", "passes", "full")

@@ -37,8 +37,8 @@ def occluded(
     wanted = rng.uniform(*occlusion.covered)
     for _ in range(_MOST_THINGS):
         thing = _placed(draw_thing(rng), rng, (width, height), rng.uniform(*occlusion.size))
-        alpha = thing[..., 3:] / 255
-        result = thing[..., :3] * alpha + result * (1 - alpha)
+        alpha = thing[..., 3:]
+        result = thing[..., :3] + result * (1 - alpha)
         hidden |= alpha[..., 0] > 0.5
         if hidden.mean() >= wanted:
             break
@@ -76,8 +76,14 @@ def painted(rng: np.random.Generator) -> np.ndarray:
 
 
 def _placed(thing: np.ndarray, rng: np.random.Generator, image_size: tuple[int, int], share: float) -> np.ndarray:
-    """The thing on an empty layer (h, w, 4) float32, its longer side `share` of the image's shorter one."""
+    """The thing on an empty layer (h, w, 4) float32, its longer side `share` of the image's shorter one.
+
+    Alpha is in 0..1, and colours are multiplied by it: else what lies behind transparent pixels bleeds into edges.
+    """
     width, height = image_size
+    thing = thing.astype(np.float32)
+    thing[..., 3] /= 255
+    thing[..., :3] *= thing[..., 3:]
     own_height, own_width = thing.shape[:2]
     scale = share * min(image_size) / max(own_height, own_width)
     if scale < 1:  # by area, or thin parts alias
@@ -86,4 +92,4 @@ def _placed(thing: np.ndarray, rng: np.random.Generator, image_size: tuple[int, 
         own_height, own_width = thing.shape[:2]
     matrix = cv2.getRotationMatrix2D((own_width / 2, own_height / 2), rng.uniform(0, 360), scale)
     matrix[:, 2] += rng.uniform(0, (width, height)) - (own_width / 2, own_height / 2)
-    return cv2.warpAffine(thing.astype(np.float32), matrix, (width, height), flags=cv2.INTER_LINEAR)
+    return cv2.warpAffine(thing, matrix, (width, height), flags=cv2.INTER_LINEAR)

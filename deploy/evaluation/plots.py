@@ -32,16 +32,19 @@ def plot_success(answers: Answers, path: Path, title: str) -> None:
     _save(drawing, path, title)
 
 
-def plot_reach(answers: Answers, path: Path, title: str, diameter: float) -> None:
-    """Share of right poses by how far the guess was turned, and by how far it was shifted in object diameters."""
+def plot_reach(answers: Answers, path: Path, title: str, diameter: float | None) -> None:
+    """Share of right poses by how far the guess was turned, and by how far it was shifted.
+
+    Shifts are in object diameters, or in field units where the diameter is not known.
+    """
     drawing, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
-    for axis, which, end, unit in ((axes[0], 0, 180.0, 1.0), (axes[1], 1, 1.0, diameter)):
-        edges = np.linspace(0, end, _BINS + 1)
+    for which, unit in ((0, 1.0), (1, diameter or 1.0)):
         for name, given in answers.items():
-            middles, shares = _binned([a for a in given if _turned(a) == (which == 0)], which, edges, unit)
-            axis.plot(middles, shares, marker="o", markersize=4, label=name)
+            if all(answer.scale_known for answer in given):
+                middles, shares = _binned([a for a in given if _turned(a) == (which == 0)], which, unit)
+                axes[which].plot(middles, shares, marker="o", markersize=4, label=name)
     _framed(axes[0], "turn of the guess, degrees", "share of right poses")
-    _framed(axes[1], "shift of the guess, object diameters", "share of right poses")
+    _framed(axes[1], f"shift of the guess, {'object diameters' if diameter else 'units'}", "share of right poses")
     axes[0].legend(loc="lower left", fontsize=8)
     _save(drawing, path, title)
 
@@ -50,11 +53,10 @@ def _turned(answer: Answer) -> bool:
     return answer.pair.guess_error[0] > 1e-3
 
 
-def _binned(
-    answers: Sequence[Answer], which: int, edges: np.ndarray, unit: float
-) -> tuple[list[float], list[float]]:
+def _binned(answers: Sequence[Answer], which: int, unit: float) -> tuple[list[float], list[float]]:
     """Middles of the bins that have any answers, and the shares of right ones."""
     sizes = np.array([answer.pair.guess_error[which] / unit for answer in answers])
+    edges = np.linspace(0, sizes.max(initial=0.0) * (1 + 1e-9), _BINS + 1)
     right = np.array([answer.right for answer in answers])
     places = np.clip(np.digitize(sizes, edges) - 1, 0, len(edges) - 2)
     bins = np.unique(places)

@@ -11,6 +11,7 @@ The keys of a method's scores, which programs may rely on:
   covariance         {50, 90, 99}: share of the true poses inside the ellipsoid of that probability; null without any
   add                {diameter, add_below_0.1d, add_s_below_0.1d, auc_add, auc_add_s}: see deploy.evaluation.surface;
                      null without a surface
+  share_of_solvable  of the pairs that any of the methods run answered rightly, the share that this one has right
 What speaks of translations is null for a method that cannot tell them.
 """
 
@@ -29,6 +30,7 @@ from deploy.results import CLOSE, CLOSE_DEG
 from stages.geometry import inverse, log_se3, rotation_error_deg, translation_error
 
 CAP_DEG, CAP = 4 * CLOSE_DEG, 4 * CLOSE
+"""Where errors are capped for comparisons, in degrees and in units of the field: four times the limits."""
 _RESAMPLES = 2000
 DIMENSIONS = 6
 _PROBABILITIES = (50, 90, 99)
@@ -88,7 +90,12 @@ def score(answers: Sequence[Answer], surface: Surface | None = None) -> dict[str
 
 
 def share_of_solvable(answers: Sequence[Answer], others: Sequence[Sequence[Answer]]) -> float | None:
-    """Of the pairs that any method answered rightly, the share that these answers have right; None without any."""
+    """Of the pairs that any method answered rightly, the share that these answers have right.
+
+    None without any such pair, and for a method that cannot tell translations.
+    """
+    if not all(answer.scale_known for answer in answers):
+        return None
     solvable = {id(a.pair) for given in [answers, *others] for a in given if a.right}
     asked = [answer for answer in answers if id(answer.pair) in solvable]
     return float(np.mean([answer.right for answer in asked])) if asked else None
@@ -125,18 +132,19 @@ def _surface_scores(answers: Sequence[Answer], surface: Surface) -> dict[str, fl
 def difference(first: Sequence[Answer], second: Sequence[Answer]) -> dict[str, Any]:
     """How much larger the first method's errors are, pair by pair: mean and its 95 % interval, by the bootstrap.
 
-    re_deg and te are over the pairs that both answered. capped_re_deg and capped_te are over all pairs, with errors of
-    at most CAP_DEG and CAP, which a missing pose has too: a few lost poses do not drown the rest. Where one method was
-    given fewer pairs, they are the first of the other's. te is null where a method cannot tell translations.
+    re_deg and te are over the `pairs_answered` by both. capped_re_deg and capped_te are over all `pairs` that both were
+    given, with errors of at most CAP_DEG and CAP, which a missing pose has too: a few lost poses do not drown the rest.
+    Guesses of one image are not independent, so that images are resampled. te is null where a method cannot tell
+    translations.
     """
-    asked = list(zip(first, second, strict=False))
-    both = [(a.errors, b.errors) for a, b in asked if a.errors and b.errors]
-    gaps = [np.subtract(a, b) for a, b in both if a is not None and b is not None]
-    capped = [np.subtract(_capped(a), _capped(b)) for a, b in asked]
+    given = {id(answer.pair): answer for answer in second}
+    asked = [(answer, given[id(answer.pair)]) for answer in first if id(answer.pair) in given]
+    both = [(a, b) for a, b in asked if a.errors and b.errors]
     scale_known = all(answer.scale_known for answer in (*first, *second))
-    figures: dict[str, Any] = {"pairs": len(gaps)}
-    for prefix, values in (("", gaps), ("capped_", capped)):
-        turn, shift = _interval(np.array(values))
+    figures: dict[str, Any] = {"pairs": len(asked), "pairs_answered": len(both)}
+    for prefix, compared, errors in (("", both, lambda answer: answer.errors), ("capped_", asked, _capped)):
+        gaps = np.array([np.subtract(errors(a), errors(b)) for a, b in compared])
+        turn, shift = _interval(gaps, np.array([a.pair.image for a, _ in compared]))
         figures |= {f"{prefix}re_deg": turn, f"{prefix}te": shift if scale_known else None}
     return figures
 
@@ -146,12 +154,16 @@ def _capped(answer: Answer) -> tuple[float, float]:
     return min(turn, CAP_DEG), min(shift, CAP)
 
 
-def _interval(gaps: np.ndarray) -> list[dict[str, float] | None]:
-    """{mean, low, high} of each column; None without rows."""
+def _interval(gaps: np.ndarray, groups: np.ndarray) -> list[dict[str, float] | None]:
+    """{mean, low, high} of each column of (n, 2), groups (n,) resampled as wholes; None without rows."""
     if len(gaps) == 0:
         return [None, None]
-    places = np.random.default_rng(0).integers(0, len(gaps), (_RESAMPLES, len(gaps)))
-    low, high = np.quantile(gaps[places].mean(axis=1), (0.025, 0.975), axis=0)
+    names, members = np.unique(groups, return_inverse=True)
+    sums, counts = np.zeros((len(names), 2)), np.bincount(members)
+    np.add.at(sums, members, gaps)
+    places = np.random.default_rng(0).integers(0, len(names), (_RESAMPLES, len(names)))
+    means = sums[places].sum(axis=1) / counts[places].sum(axis=1)[:, None]
+    low, high = np.quantile(means, (0.025, 0.975), axis=0)
     mean = gaps.mean(axis=0)
     return [{"mean": float(mean[i]), "low": float(low[i]), "high": float(high[i])} for i in (0, 1)]
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
@@ -30,12 +32,12 @@ class Surface:
 
     points: np.ndarray
 
-    @property
+    @cached_property
     def diameter(self) -> float:
         """The largest distance between two of the points."""
         try:
-            outermost = self.points[ConvexHull(self.points).vertices]
-        except QhullError:  # flat, or too few points
+            outermost = self.points[ConvexHull(self.points, qhull_options="QJ").vertices]
+        except QhullError:  # too few points
             outermost = self.points
         return float(pdist(outermost).max())
 
@@ -44,10 +46,14 @@ def read_surface(path: Path) -> Surface:
     """Points (n, 3) of a .npy file. Raises DatasetError."""
     try:
         points = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise DatasetError(f"{path}: no readable .npy file of surface points ({error})") from error
+    if not isinstance(points, np.ndarray) or points.dtype.kind not in "fiu":
+        raise DatasetError(f"{path}: expected one array of numbers, (n, 3)")
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
         raise DatasetError(f"{path}: expected finite points of shape (n, 3), got {points.dtype} {points.shape}")
+    if np.ptp(points, axis=0).max() <= 0:
+        raise DatasetError(f"{path}: its points are all at one place, so that errors have no measure")
     return Surface(points.astype(np.float64))
 
 

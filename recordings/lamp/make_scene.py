@@ -39,7 +39,6 @@ DISTANCES = (3.9, 4.1)
 AIM_ERROR = 0.02
 BOX_MARGIN = 0.03
 SURFACE_POINTS = 4096
-LAMP_STRENGTH = 1.0
 BACKDROP = 0.86
 COUNTS = {"train": 100, "test": 25}
 
@@ -61,7 +60,6 @@ def lit(samples: int, threads: int) -> bpy.types.Scene:
     for thing in scene.objects:
         if thing.type == "LIGHT":
             thing.visible_camera = False
-            thing.data.energy *= LAMP_STRENGTH
     scene.cycles.samples, scene.cycles.use_denoising = samples, True
     scene.cycles.use_adaptive_sampling, scene.cycles.adaptive_threshold = True, 0.003
     scene.cycles.adaptive_min_samples = 16

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 _CELLS = 8
+_LEAST = 1e-14
 
 
 def twist_covariance(
@@ -17,16 +18,22 @@ def twist_covariance(
 ) -> np.ndarray:
     """Covariance (6, 6) of the left twist that minimises weighted squared residuals.
 
-    jacobian (n, k, 6) of k residuals of each of n pixels (n, 2); weights (n,), 1 / variance up to a factor;
-    variance: of a residual of weight 1; shared: standard deviation of a cell's offset as a multiple of the mean
-    residual's; the image's longer side has eight cells. Directions that nothing determines have no variance.
+    jacobian (n, k, 6) of k residuals of each of n pixels (n, 2), n > 0; weights (n,), 1 / variance up to a factor;
+    variance: of a residual of weight 1; shared: standard deviation of a cell's offset as a multiple of a typical
+    residual's; the image's longer side has eight cells. Directions that nothing determines have a huge variance.
     """
     weighted = weights[:, None, None] * jacobian
-    inverse = np.linalg.pinv(np.tensordot(weighted, jacobian, axes=((0, 1), (0, 1))), hermitian=True)
+    inverse = _inverse(np.tensordot(weighted, jacobian, axes=((0, 1), (0, 1))))
     places = np.floor(pixels * (_CELLS / longer_side)).astype(int)
     _, cells = np.unique(places, axis=0, return_inverse=True)
     cells = cells.ravel()
-    sums = np.zeros((cells.max(initial=-1) + 1, *jacobian.shape[1:]))
+    sums = np.zeros((cells.max() + 1, *jacobian.shape[1:]))
     np.add.at(sums, cells, weighted)
-    together = np.tensordot(sums, sums, axes=((0, 1), (0, 1))) * (shared**2 / max(float(weights.mean()), 1e-12))
+    typical = max(float((weights**2).sum() / max(weights.sum(), 1e-12)), 1e-12)
+    together = np.tensordot(sums, sums, axes=((0, 1), (0, 1))) * (shared**2 / typical)
     return variance * (inverse + inverse @ together @ inverse)
+
+
+def _inverse(hessian: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(hessian)
+    return (vectors / np.maximum(values, _LEAST * max(float(values[-1]), 1e-300))) @ vectors.T

@@ -15,7 +15,7 @@ class LiftingConfig:
     angle_deg: float = 3.0
     """how far around the point a nearby view is"""
     gamma: float = 1.0
-    """points whose root mean square displacement exceeds it are discarded; the unit is that of gamma_unit"""
+    """points with a larger root mean square displacement are discarded if `enough` remain; in gamma_unit"""
     enough: int = 150
     """where fewer points are so consistent, the most consistent ones are kept up to this number"""
     gamma_most: float = 8.0

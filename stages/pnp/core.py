@@ -47,13 +47,13 @@ def solve(
     camera: Camera,
     config: PnpConfig | None = None,
     confidence: np.ndarray | None = None,
-    guess: np.ndarray | None = None,
+    seen_from: np.ndarray | None = None,
 ) -> PnpResult:
     """The camera's pose from pixels (n, 2), distorted as the camera has them, and points (n, 3) in the object.
 
-    confidence (n,), relative to each other, counts in the refinement and not in RANSAC. guess (4, 4): the pose that
-    the points were seen from; the further it is from the pose found, the less certain is that. The same input gives
-    the same result. Never raises for data that hold no pose: the result says why.
+    confidence (n,), relative to each other, counts in the refinement and not in RANSAC. seen_from (4, 4): the pose of
+    the view that gave the points; the further it is from the pose found, the less certain is that. The same input
+    gives the same result. Never raises for data that hold no pose: the result says why.
     """
     config = config or PnpConfig()
     if len(pixels_in_frame) < max(config.min_inliers, _MIN_POINTS):
@@ -73,7 +73,7 @@ def solve(
     if fit is None or inliers.sum() < config.min_inlier_ratio * len(pixels):
         return _failed("no_consensus", len(pixels))
     longer_side = max(camera.width, camera.height)
-    angle = 0.0 if guess is None else _angle_between_views(points[inliers], guess, fit.cam_from_object)
+    angle = 0.0 if seen_from is None else _angle_between_views(points[inliers], seen_from, fit.cam_from_object)
     shared = config.shared_error + config.shared_error_by_angle * angle / inliers.mean()
     covariance = twist_covariance(fit.jacobian, fit.weights, pixels[inliers], longer_side, fit.variance, shared)
     if not _plausible(covariance, pixels[inliers], longer_side, config):

@@ -98,4 +98,3 @@ def _huber_weights(residuals: np.ndarray, weights: np.ndarray, delta: float) -> 
 def _huber_cost(residuals: np.ndarray, weights: np.ndarray, delta: float) -> float:
     length = _lengths(residuals, weights)
     return float(np.where(length <= delta, length**2, delta * (2 * length - delta)).sum())
-

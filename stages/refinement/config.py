@@ -39,4 +39,4 @@ class RefinementConfig:
     converged: float = 2e-5
     """a step that is smaller, in the same unit, is the last"""
     shared_error: float = 0.7
-    """how far neighbouring pixels err together, as a multiple of how far each errs by itself"""
+    """how far neighbouring pixels err together, as a multiple of their differences in colour"""

@@ -58,9 +58,9 @@ class TrackingConfig:
     depth: int = 2
     """Frames in flight at once."""
     passes: int = 3
-    """Most passes over a frame whose guess may be far off: the pose found becomes the next guess."""
+    """Most passes from one guess that may be far off: the pose found becomes the next guess."""
     retries: int = 1
-    """How many other guesses to try on the same frame when one has led nowhere."""
+    """How many other guesses to try on the same frame of a video when one has led nowhere."""
     searches: int = 40
     """How many training views to try, nearest to the guess first, for an image that stands by itself and whose pose
     was not found from its guess; none where there is only one pass."""

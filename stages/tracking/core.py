@@ -106,7 +106,7 @@ class Tracker:
         self._note_latency(now_ns - attempt.sent_ns)
         guess = self._policy.next_guess(attempt, result)
         if guess is not None:
-            attempt = self._in_flight[result.frame_id] = attempt.again(guess, result, now_ns)
+            attempt = self._in_flight[result.frame_id] = attempt.again(guess, now_ns)
             return [GuessOrder(attempt.frame, attempt.pass_index, guess)]
         del self._in_flight[result.frame_id]
         self._finished += 1

@@ -16,7 +16,16 @@ from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseRe
 from stages.tracking.scoring import believed, score
 from stages.tracking.views import TrainingViews, nearest_first
 
-_FRAMES_KEPT = 256
+_TRUTHS_KEPT = 256
+
+
+@dataclass
+class _Trial:
+    """A frame in flight: its guess, the newest believed result, and the training views to try (None: not asked for)."""
+
+    guess: np.ndarray
+    found: PoseResult | None = None
+    others: list[np.ndarray] | None = None
 
 
 class EachFramePolicy:
@@ -32,7 +41,7 @@ class EachFramePolicy:
         self._scale = views.scale
         self._guesses = guesses
         self._settled = Limit(config.settled_deg, config.settled * self._scale)
-        self._others: OrderedDict[int, list[np.ndarray]] = OrderedDict()
+        self._trials: dict[int, _Trial] = {}
 
     def on_truth(self, frame_id: int, cam_from_object: np.ndarray | None) -> None:
         """The guesses are given; the truth is not asked for."""
@@ -40,52 +49,54 @@ class EachFramePolicy:
     def first_guess(self, frame: FrameInfo) -> PoseGuess | None:
         """PRIOR, or None for a frame without a guess."""
         guess = self._guesses.get(frame.frame_id)
-        return None if guess is None else PoseGuess(GuessReason.PRIOR, guess)
+        if guess is None:
+            return None
+        self._trials[frame.frame_id] = _Trial(guess)
+        return PoseGuess(GuessReason.PRIOR, guess)
 
     def next_guess(self, attempt: Attempt, result: PoseResult) -> PoseGuess | None:
-        """NEXT_PASS until the pose settles or the passes are used up; then RELOCALISATION unless it is believed."""
-        pose = result.cam_from_object if self._quality(result) >= self._config.score.usable else None
-        more = attempt.passes < self._config.passes
-        if more and pose is not None and not self._settled.holds(attempt.guess.cam_from_object, pose):
-            return PoseGuess(GuessReason.NEXT_PASS, pose)
-        if self._config.passes == 1 or self._believed(attempt, result) is not None:
+        """NEXT_PASS until the pose settles or the passes are used up; then RELOCALISATION unless one is believed."""
+        trial, guess = self._trials[attempt.frame.frame_id], attempt.guess.cam_from_object
+        quality, pose = self._quality(result), result.cam_from_object
+        if pose is not None and quality >= self._config.score.usable:
+            if self._believes(attempt, result):
+                trial.found = result
+            if attempt.passes < self._config.passes and not self._settled.holds(guess, pose):
+                return PoseGuess(GuessReason.NEXT_PASS, pose)
+        if self._config.passes == 1 or trial.found is not None:
             return None
-        others = self._other_guesses(attempt.frame.frame_id)
-        return PoseGuess(GuessReason.RELOCALISATION, others[attempt.retries]) if attempt.retries < len(others) else None
+        if trial.others is None:
+            trial.others = self._other_guesses(trial.guess)
+        left = trial.others[attempt.retries :]
+        return PoseGuess(GuessReason.RELOCALISATION, left[0]) if left else None
 
     def conclude(self, attempt: Attempt, result: PoseResult) -> Belief:
-        """The newest pose that is believed, TRACKING; LOST without one."""
-        self._others.pop(attempt.frame.frame_id, None)
-        found = self._believed(attempt, result)
+        """The newest pose that was believed, TRACKING; LOST without one."""
+        found = self._trials.pop(attempt.frame.frame_id).found
+        if self._believes(attempt, result):
+            found = result
         if found is None:
-            return Belief(TrackingState.LOST, self._quality(result))
+            return Belief(TrackingState.LOST, 0.0)
         return Belief(TrackingState.TRACKING, self._quality(found), found.cam_from_object, found.covariance)
 
     def missed(self, frame: FrameInfo) -> Belief:
         """Nothing is known of a frame that did not come back."""
-        self._others.pop(frame.frame_id, None)
+        self._trials.pop(frame.frame_id, None)
         return Belief(TrackingState.LOST, 0.0)
 
     def _quality(self, result: PoseResult) -> float:
         return score(result, self._config.score, self._scale)
 
-    def _believed(self, attempt: Attempt, result: PoseResult) -> PoseResult | None:
+    def _believes(self, attempt: Attempt, result: PoseResult) -> bool:
         if self._config.passes == 1:
-            return result if self._quality(result) >= self._config.score.usable else None
-        if believed(result, attempt.guess.cam_from_object, self._config, self._scale):
-            return result
-        earlier = attempt.earlier
-        return earlier if earlier is not None and believed(earlier, None, self._config, self._scale) else None
+            return self._quality(result) >= self._config.score.usable
+        return believed(result, attempt.guess.cam_from_object, self._config, self._scale)
 
-    def _other_guesses(self, frame_id: int) -> list[np.ndarray]:
-        """Training views in the order in which they are tried for a frame."""
-        if frame_id not in self._others:
-            cover = Limit(self._config.cover_deg, self._config.cover * self._scale)
-            order = nearest_first(self._views.cam_from_object, self._guesses[frame_id], cover)
-            self._others[frame_id] = [self._views.cam_from_object[i] for i in order[: self._config.searches]]
-            if len(self._others) > _FRAMES_KEPT:
-                self._others.popitem(last=False)
-        return self._others[frame_id]
+    def _other_guesses(self, guess: np.ndarray) -> list[np.ndarray]:
+        """Training views in the order in which they are tried."""
+        cover = Limit(self._config.cover_deg, self._config.cover * self._scale)
+        order = nearest_first(self._views.cam_from_object, guess, cover)
+        return [self._views.cam_from_object[i] for i in order[: self._config.searches]]
 
 
 @dataclass(frozen=True)
@@ -114,5 +125,5 @@ class PerturbedTruthPolicy(EachFramePolicy):
         rng = np.random.default_rng([self._config.seed, frame_id])
         disturbance = self._disturbance
         self._known[frame_id] = perturb(cam_from_object, rng, disturbance.angle_deg, disturbance.max_translation)
-        if len(self._known) > _FRAMES_KEPT:
+        if len(self._known) > _TRUTHS_KEPT:
             self._known.popitem(last=False)

@@ -46,7 +46,7 @@ class PoseResult:
 class Attempt:
     """A frame in flight.
 
-    pass_index counts all its passes, `passes` those since a fresh guess; `earlier` is the last pose found before.
+    pass_index counts all its passes, `passes` those since a fresh guess.
     """
 
     frame: FrameInfo
@@ -55,10 +55,9 @@ class Attempt:
     pass_index: int = 0
     passes: int = 1
     retries: int = 0
-    earlier: PoseResult | None = None
 
-    def again(self, guess: PoseGuess, result: PoseResult, now_ns: int) -> Attempt:
-        """The next pass over this frame, after a result."""
+    def again(self, guess: PoseGuess, now_ns: int) -> Attempt:
+        """The next pass over this frame."""
         carried_on = guess.reason is GuessReason.NEXT_PASS
         return replace(
             self,
@@ -67,7 +66,6 @@ class Attempt:
             pass_index=self.pass_index + 1,
             passes=self.passes + 1 if carried_on else 1,
             retries=self.retries if carried_on else self.retries + 1,
-            earlier=result if result.ok else self.earlier,
         )
 
 

@@ -25,17 +25,17 @@ def score(result: PoseResult, config: ScoreConfig, scale: float = 1.0) -> float:
     return float(np.clip(min(measures), 0.0, 1.0))
 
 
-def believed(result: PoseResult, guess: np.ndarray | None, config: TrackingConfig, scale: float = 1.0) -> bool:
-    """Whether the pose of an image that stands by itself is right beyond doubt.
+def believed(result: PoseResult, guess: np.ndarray, config: TrackingConfig, scale: float = 1.0) -> bool:
+    """Whether the pose of an image that stands by itself is believed.
 
-    It is if it scores high, or if a pass that began there (`guess`) has found it again; a wrong pose has few inliers
-    and does not lead to itself.
+    It is if it scores high, or if it lies where its pass began (`guess`); a wrong pose has few inliers and does not
+    lead to itself.
     """
-    quality = score(result, config.score, scale)
-    if quality >= config.score.sure or result.cam_from_object is None:
-        return quality >= config.score.sure
+    quality, pose = score(result, config.score, scale), result.cam_from_object
+    if pose is None or quality < config.score.usable:
+        return False
     settled = Limit(config.settled_deg, config.settled * scale)
-    return guess is not None and quality >= config.score.usable and settled.holds(guess, result.cam_from_object)
+    return quality >= config.score.sure or settled.holds(guess, pose)
 
 
 def deviations(covariance: np.ndarray) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from support.analytic_scene import AnalyticScene, camera, viewpoint
 from deploy.settings import Settings
 from stages.geometry import Camera, camera_centre, exp_se3, inverse, perturb, rotation_error_deg, translation_error
 from stages.matching.core import MatchingConfig
-from tests.benchmark.baselines import BASELINES, SCALE_UNKNOWN, Essential, Inerf, InerfConfig, PiNerf, PiNerfConfig
+from tests.benchmark.baselines import BASELINES, Essential, Inerf, InerfConfig, PiNerf, PiNerfConfig
 from tests.benchmark.baselines.descent import left_jacobian
 from tests.benchmark.baselines.inerf import interest_region, squared_error
 from tests.benchmark.baselines.pinerf import Hypotheses, Target, errors, loss, resampled
@@ -174,4 +174,4 @@ def test_an_image_with_nothing_to_find_is_no_error(scene: AnalyticScene) -> None
 
 def test_only_the_essential_matrix_leaves_the_scale_open() -> None:
     assert set(BASELINES) == {"inerf", "pi-nerf", "essential"}
-    assert {"essential"} == SCALE_UNKNOWN
+    assert [kind.scale_known for kind in (Inerf, PiNerf, Essential)] == [True, True, False]

@@ -17,10 +17,11 @@ from stages.geometry import camera_centre, exp_se3, look_at, rotation_about
 
 TRUTHS = [look_at((4 * np.cos(a), 4 * np.sin(a), 1.0), (0, 0, 0), (0, 0, 1)) for a in np.arange(7.0)]
 
+PAIR = Pair(0, 0, np.eye(4), np.eye(4))
 
-def answer(re_deg: float | None, te: float = 0.0, seconds: float = 1.0) -> Answer:
+
+def answer(re_deg: float | None, te: float = 0.0, seconds: float = 1.0, pair: Pair = PAIR) -> Answer:
     """One whose errors are known; no pose where the rotation is None."""
-    pair = Pair(0, 0, np.eye(4), np.eye(4))
     if re_deg is None:
         return Answer(pair, None, None, seconds)
     pose = rotation_about((0, 0, 1), np.deg2rad(re_deg))
@@ -71,22 +72,30 @@ def test_a_true_covariance_covers_what_it_says() -> None:
     assert [covered[p] for p in ("50", "90", "99")] == pytest.approx([0.5, 0.9, 0.99], abs=0.03)
 
 
+def over(pairs: list[Pair], errors: list[tuple[float | None, float]]) -> list[Answer]:
+    """Answers to pairs with these errors."""
+    return [answer(turn, shift, pair=pair) for pair, (turn, shift) in zip(pairs, errors, strict=True)]
+
+
 def test_differences_are_taken_pair_by_pair() -> None:
     rng = np.random.default_rng(1)
     base = rng.uniform(0, 10, 60)
-    first = [answer(b + 0.5, 0.02) for b in base] + [answer(None)]
-    second = [answer(b, 0.02) for b in base] + [answer(1)]
-    gap = difference(first, second)
-    assert gap["pairs"] == 60
+    pairs = [Pair(0, i, np.eye(4), np.eye(4)) for i in range(61)]
+    first = over(pairs, [*((b + 0.5, 0.02) for b in base), (None, 0.0)])
+    second = over(pairs, [*((b, 0.02) for b in base), (1.0, 0.0)])
+    gap = difference(first, second[::-1])
+    assert (gap["pairs"], gap["pairs_answered"]) == (61, 60)
     assert gap["re_deg"] == pytest.approx({"mean": 0.5, "low": 0.5, "high": 0.5})
     assert gap["te"]["mean"] == pytest.approx(0)
-    assert difference([answer(None)], [answer(1)])["pairs"] == 0
+    assert difference(first[:5], second)["pairs"] == 5
+    assert difference(first[60:], second[60:])["re_deg"] is None
 
 
 def test_a_missing_pose_counts_as_far_off_where_errors_are_capped() -> None:
-    first = [answer(None), answer(170, 9.0), answer(3, 0.1)]
-    gap = difference(first, [answer(2, 0.05), answer(30, 1.0), answer(1, 0.1)])
-    assert gap["pairs"] == 2
+    pairs = [Pair(0, i, np.eye(4), np.eye(4)) for i in range(3)]
+    first = over(pairs, [(None, 0.0), (170, 9.0), (3, 0.1)])
+    gap = difference(first, over(pairs, [(2, 0.05), (30, 1.0), (1, 0.1)]))
+    assert gap["pairs_answered"] == 2
     assert gap["capped_re_deg"]["mean"] == pytest.approx((18 + 0 + 2) / 3)
     assert gap["capped_te"]["mean"] == pytest.approx((0.15 + 0 + 0) / 3)
 
@@ -129,9 +138,10 @@ def test_translations_without_a_scale_are_left_out() -> None:
     scores = score(unscaled)
     assert scores["share_re_below_5deg"] == 0.5
     assert scores["mean_re_deg"] == pytest.approx(5)
+    assert share_of_solvable(unscaled, [[answer(1)]]) is None
     assert scores["mean_te"] is scores["share_te_below_0.05"] is scores["share_ok_right"] is None
-    gap = difference(unscaled, [answer(1), answer(1)])
-    assert gap["re_deg"]["mean"] == pytest.approx(4)
+    gap = difference(unscaled[1:], [answer(1)])
+    assert gap["re_deg"]["mean"] == pytest.approx(8)
     assert gap["te"] is None
 
 
@@ -177,6 +187,34 @@ def test_published_methods_run_on_the_same_pairs(tmp_path: Path) -> None:
     assert [methods[name]["pairs"] for name in ("essential", "inerf")] == [2, 1]
     assert methods["essential"]["mean_te"] is None
     assert methods["inerf"]["share_ok"] == 1
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--images", "0"], "--images must be at least 1"),
+        (["--seeds", "-1"], "--seeds one or more from 0 on"),
+        (["--shift", "-0.1"], "expected a length of 0 or more"),
+        (["--angle-deg", "40", "10"], "expected 0 <= least <= most <= 180"),
+        (["--occluders", "somewhere"], "use --protocol occluded"),
+        (["--plot", "curves.txt"], "ends with .png"),
+    ],
+)
+def test_flags_that_mean_nothing_are_refused_at_once(
+    flags: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    field = demo_file("field.safetensors")
+    assert main(["evaluate", str(field), str(field.parent), *flags]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_guesses_of_one_image_are_resampled_together() -> None:
+    """Ten times the guesses of the same two images say no more about other images."""
+    few = [replace(answer(error), pair=Pair(0, i, np.eye(4), np.eye(4))) for i, error in enumerate((1.0, 3.0))]
+    many = [replace(a, pair=replace(a.pair)) for a in few for _ in range(10)]
+    for answers in (few, many):
+        gap = difference(answers, [replace(a, cam_from_object=np.eye(4)) for a in answers])["re_deg"]
+        assert gap == pytest.approx({"mean": 2.0, "low": 1.0, "high": 3.0}, abs=1e-6)
 
 
 def test_an_unknown_method_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,10 +17,11 @@ def written_out(
     n, k = jacobian.shape[:2]
     flat, w = jacobian.reshape(n * k, 6), np.repeat(weights, k)
     errors = np.diag(variance / w)
+    together = variance * shared**2 * weights.sum() / (weights**2).sum()
     for i in range(n):
         for j in range(n):
             if tuple(pixels[i] // (side / 8)) == tuple(pixels[j] // (side / 8)):
-                errors[i * k : (i + 1) * k, j * k : (j + 1) * k] += np.eye(k) * variance * shared**2 / weights.mean()
+                errors[i * k : (i + 1) * k, j * k : (j + 1) * k] += np.eye(k) * together
     gain = np.linalg.inv(flat.T @ (w[:, None] * flat)) @ (flat.T * w)
     return gain @ errors @ gain.T
 
@@ -46,3 +47,20 @@ def test_more_of_the_same_cell_tells_no_more_than_the_cell() -> None:
     assert np.trace(alone) == pytest.approx(np.trace(twist_covariance(few, np.ones(30), places, 400, 1.0, 0.0)) / 200)
     assert 0.3 * np.trace(sparse) < np.trace(dense) < np.trace(sparse)
 
+
+def test_what_has_no_weight_tells_nothing() -> None:
+    rng = np.random.default_rng(1)
+    jacobian, weights, pixels = rng.normal(size=(40, 2, 6)), np.ones(40), rng.uniform(0, 400, (40, 2))
+    padded = np.concatenate([jacobian, rng.normal(size=(400, 2, 6))]), np.concatenate([weights, np.zeros(400)])
+    places = np.concatenate([pixels, rng.uniform(0, 400, (400, 2))])
+    alone = twist_covariance(jacobian, weights, pixels, 400, 1.0, 0.7)
+    np.testing.assert_allclose(twist_covariance(*padded, places, 400, 1.0, 0.7), alone, rtol=1e-9)
+
+
+def test_what_nothing_determines_is_uncertain() -> None:
+    rng = np.random.default_rng(2)
+    jacobian = rng.normal(size=(40, 2, 6))
+    jacobian[..., 2] = 0
+    covariance = twist_covariance(jacobian, np.ones(40), rng.uniform(0, 400, (40, 2)), 400, 1.0, 0.7)
+    assert covariance[2, 2] > 1e8
+    assert np.diag(covariance)[[0, 1, 3, 4, 5]].max() < 1

@@ -107,6 +107,13 @@ def test_a_smaller_gamma_keeps_fewer_and_a_unit_is_absolute(scene: AnalyticScene
     loose, tight = kept(LiftingConfig(gamma=8.0)), kept(LiftingConfig(gamma=0.5))
     assert (tight <= loose).all()
     assert 0 < tight.sum() < loose.sum()
+    strict = kept(LiftingConfig(gamma=1e-6, enough=0))
+    more = int(strict.sum()) + 40
+    some = kept(LiftingConfig(gamma=1e-6, enough=more, gamma_most=1e9))
+    assert (strict <= some).all()
+    assert some.sum() == more
+    limited = kept(LiftingConfig(gamma=1e-6, enough=more, gamma_most=1.0))
+    np.testing.assert_array_equal(limited, strict)
     absolute = LiftingConfig(gamma=0.02, gamma_unit="field")
     lifted = lift(scene, view.depth, view.opacity, CAMERA, POSE, pixels, np.random.default_rng(0), absolute)
     np.testing.assert_array_equal(lifted.kept, lifted.consistency <= 0.02**2)

@@ -88,7 +88,7 @@ def test_the_covariance_is_that_of_the_error(noise_px: float, shared: float) -> 
 def test_a_pose_seen_from_afar_is_less_certain() -> None:
     pixels, points, _ = problem(np.random.default_rng(2), 100, 0.2, 0.5)
     elsewhere = look_at((3, 1, 2), (0, 0, 0), (0, 0, 1))
-    near, far = (solve(pixels, points, CAMERA, guess=guess) for guess in (POSE, elsewhere))
+    near, far = (solve(pixels, points, CAMERA, seen_from=view) for view in (POSE, elsewhere))
     np.testing.assert_array_equal(solved(near), solved(far))
     assert near.covariance is not None
     assert far.covariance is not None

@@ -166,3 +166,27 @@ def test_the_region_is_the_keypoints_dilated_by_five_pixels_n_times() -> None:
         region = keypoint_region(keypoints, cam, n)
         assert region.sum() == width**2
         assert region[10 - width // 2 : 11 + width // 2, 10 - width // 2 : 11 + width // 2].all()
+
+
+def test_a_refined_pose_has_a_covariance_of_its_own(
+    scene: AnalyticScene, image: np.ndarray, keypoints: np.ndarray
+) -> None:
+    refined = refine(scene, image, CAMERA, guess(3), keypoints, np.random.default_rng(0), CONFIG)
+    assert refined.refined
+    assert refined.covariance is not None
+    assert np.linalg.eigvalsh(refined.covariance).min() > 0
+    sigma_deg = np.rad2deg(np.sqrt(np.trace(refined.covariance[3:, 3:])))
+    assert error(refined) < 4 * sigma_deg < 2.0
+    at_once = refine(scene, image, CAMERA, POSE, keypoints, np.random.default_rng(0), replace(CONFIG, steps=0))
+    assert at_once.covariance is None
+
+
+def test_pixels_without_weight_do_not_count_in_the_covariance(scene: AnalyticScene, image: np.ndarray) -> None:
+    photometric = Photometric(scene, CONFIG)
+    opacity = scene.render_rays(*rays(CAMERA, POSE)).opacity
+    solid, empty = CAMERA.grid()[opacity > 0.99][::7], CAMERA.grid()[opacity < 0.01][:600]
+    alone, _ = photometric.weighted_by_opacity(photometric.sample(image, CAMERA, solid), POSE)
+    both = photometric.sample(image, CAMERA, np.concatenate([solid, empty]))
+    padded, _ = photometric.weighted_by_opacity(both, POSE)
+    expected = photometric.covariance(alone, POSE, CAMERA, 0.7)
+    np.testing.assert_allclose(photometric.covariance(padded, POSE, CAMERA, 0.7), expected, rtol=1e-3)

@@ -17,7 +17,7 @@ from stages.tracking.config import TrackingConfig
 from stages.tracking.distance import Limit, pairwise
 from stages.tracking.frame_policies import EachFramePolicy, PerturbedTruthPolicy
 from stages.tracking.guesses import make_policy, needs_truth, start_pose
-from stages.tracking.policy import Attempt, FrameInfo, PoseGuess, PoseResult
+from stages.tracking.policy import Attempt, FrameInfo, PoseResult
 from stages.tracking.track_policy import TrackPolicy
 from stages.tracking.views import Keyframes, Relocaliser, TrainingViews, farthest_point_order, nearest_first
 
@@ -145,7 +145,7 @@ def test_single_frames_get_passes_until_the_pose_settles() -> None:
     guess = policy.next_guess(attempt, first)
     assert guess is not None
     assert guess.reason is GuessReason.NEXT_PASS
-    attempt = attempt.again(guess, first, 0)
+    attempt = attempt.again(guess, 0)
     assert policy.next_guess(attempt, result(on_sphere(20.1, 30), 1)) is None
     assert each_frame(passes=1)[0].next_guess(each_frame(1)[1], first) is None
 
@@ -155,9 +155,12 @@ def test_a_single_frame_keeps_an_earlier_pose_when_its_last_pass_fails() -> None
     first = result(on_sphere(20, 30))
     guess = policy.next_guess(attempt, first)
     assert guess is not None
-    belief = policy.conclude(attempt.again(guess, first, 0), result(None, 1))
+    attempt = attempt.again(guess, 0)
+    assert policy.next_guess(attempt, result(None, 1)) is None
+    belief = policy.conclude(attempt, result(None, 1))
     assert belief.state is TrackingState.TRACKING
     assert belief.cam_from_object is first.cam_from_object
+    policy, attempt = each_frame()
     assert policy.conclude(attempt, result(None)).state is TrackingState.LOST
     assert policy.missed(FRAME).cam_from_object is None
 
@@ -168,7 +171,7 @@ def test_other_views_are_tried_until_a_pose_is_believed() -> None:
     while (guess := policy.next_guess(attempt, result(None, attempt.pass_index))) is not None and len(tried) < 5:
         assert guess.reason is GuessReason.RELOCALISATION
         tried.append(guess.cam_from_object)
-        attempt = attempt.again(guess, result(None, attempt.pass_index), 0)
+        attempt = attempt.again(guess, 0)
     distances = [rotation_error_deg(on_sphere(0, 30), pose) for pose in tried]
     assert distances == sorted(distances)
     assert all(any((pose == view).all() for view in VIEWS.cam_from_object) for pose in tried)
@@ -179,13 +182,38 @@ def test_other_views_are_tried_until_a_pose_is_believed() -> None:
 def test_searching_ends_and_leaves_no_pose() -> None:
     config = TrackingConfig(searches=2)
     policy = EachFramePolicy(config, VIEWS, {7: on_sphere(0, 30)})
-    attempt = Attempt(FRAME, PoseGuess(GuessReason.PRIOR, on_sphere(0, 30)), 0)
+    prior = policy.first_guess(FRAME)
+    assert prior is not None
+    attempt = Attempt(FRAME, prior, 0)
     for _ in range(2):
         guess = policy.next_guess(attempt, result(None))
         assert guess is not None
-        attempt = attempt.again(guess, result(None), 0)
+        attempt = attempt.again(guess, 0)
     assert policy.next_guess(attempt, result(None)) is None
     assert policy.conclude(attempt, result(None)).cam_from_object is None
+
+
+def test_a_sure_pose_outlives_what_comes_after_it() -> None:
+    policy, attempt = each_frame(passes=3)
+    sure = result(on_sphere(20, 30))
+    weak = replace(result(on_sphere(50, 30), 1), inliers=14, correspondences=60)
+    for found in (sure, weak):
+        guess = policy.next_guess(attempt, found)
+        assert guess is not None
+        assert guess.reason is GuessReason.NEXT_PASS
+        attempt = attempt.again(guess, 0)
+    assert policy.next_guess(attempt, result(None, 2)) is None
+    assert policy.conclude(attempt, result(None, 2)).cam_from_object is sure.cam_from_object
+
+
+def test_forgotten_truths_do_not_matter_to_frames_in_flight() -> None:
+    policy = perturbed()
+    policy.on_truth(FRAME.frame_id, on_sphere(0, 30))
+    guess = policy.first_guess(FRAME)
+    assert guess is not None
+    for other in range(1000, 1400):
+        policy.on_truth(other, on_sphere(0, 30))
+    assert policy.next_guess(Attempt(FRAME, guess, 0), result(None)) is not None
 
 
 def test_a_weak_pose_is_believed_once_a_pass_has_found_it_again() -> None:
@@ -194,23 +222,27 @@ def test_a_weak_pose_is_believed_once_a_pass_has_found_it_again() -> None:
     guess = policy.next_guess(attempt, weak)
     assert guess is not None
     assert guess.reason is GuessReason.NEXT_PASS
-    attempt = attempt.again(guess, weak, 0)
+    attempt = attempt.again(guess, 0)
     found_again = replace(weak, cam_from_object=on_sphere(20.2, 30), pass_index=1)
     assert policy.next_guess(attempt, found_again) is None
     assert policy.conclude(attempt, found_again).cam_from_object is found_again.cam_from_object
+    policy, first = each_frame(passes=2)
     elsewhere = replace(weak, cam_from_object=on_sphere(60, 30), pass_index=1)
-    assert policy.conclude(attempt, elsewhere).cam_from_object is None
+    guess = policy.next_guess(first, weak)
+    assert guess is not None
+    attempt = first.again(guess, 0)
     again = policy.next_guess(attempt, elsewhere)
     assert again is not None
     assert again.reason is GuessReason.RELOCALISATION
+    assert policy.conclude(attempt, elsewhere).cam_from_object is None
 
 
 def test_a_single_pass_has_nothing_to_confirm_it() -> None:
     policy, attempt = each_frame(passes=1)
     weak = replace(result(on_sphere(20, 30)), inliers=14, correspondences=60)
+    assert policy.next_guess(attempt, result(None)) is None
     assert policy.next_guess(attempt, weak) is None
     assert policy.conclude(attempt, weak).cam_from_object is weak.cam_from_object
-    assert policy.next_guess(attempt, result(None)) is None
 
 
 def test_nearest_first_lie_apart_from_the_guess_and_each_other() -> None:

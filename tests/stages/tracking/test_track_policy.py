@@ -193,9 +193,9 @@ def test_no_more_passes_than_configured() -> None:
     result = PoseResult(0, 0, True, on_sphere(20, 30), None, 100, 120, 1.0)
     guess = camera.policy.next_guess(attempt, result)
     assert guess is not None
-    assert camera.policy.next_guess(attempt.again(guess, result, 0), result) is None
+    assert camera.policy.next_guess(attempt.again(guess, 0), result) is None
     far = PoseResult(0, 1, True, on_sphere(40, 30), None, 100, 120, 1.0)
-    assert camera.policy.next_guess(attempt.again(guess, result, 0), far) is None
+    assert camera.policy.next_guess(attempt.again(guess, 0), far) is None
 
 
 def test_retries_try_a_keyframe_and_then_other_views() -> None:
@@ -204,5 +204,5 @@ def test_retries_try_a_keyframe_and_then_other_views() -> None:
     failure = PoseResult(camera.frame_id, 0, False)
     while (guess := camera.policy.next_guess(attempt, failure)) is not None:
         reasons.append(guess.reason)
-        attempt = attempt.again(guess, failure, 0)
+        attempt = attempt.again(guess, 0)
     assert reasons == [GuessReason.KEYFRAME, GuessReason.RELOCALISATION]

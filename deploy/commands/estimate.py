@@ -25,9 +25,12 @@ class Options:
 
     Example: fieldpose estimate out/lego.safetensors photo.png --guess train:r_10 --json out/pose.json
 
-    Exits with 1 where no pose is found. The JSON file has: ok, reason, cam_from_object (4x4 by rows, OpenCV axes),
-    covariance (6x6 of the left twist: translation, rotation), inliers, correspondences, residual_px, refined,
-    loss_before, loss_after, passes, camera, seconds, stage_ms.
+    Where the guess leads to no pose that is believed, training views are tried, the nearest first
+    (--tracking.searches). Exits with 1 where no pose is found.
+
+    The JSON file has: ok, reason, cam_from_object (4x4 by rows, OpenCV axes), covariance (6x6 of the left twist:
+    translation, rotation), inliers, correspondences, residual_px, refined, loss_before, loss_after, passes, camera,
+    seconds, stage_ms.
     """
 
     field: tyro.conf.Positional[Path]

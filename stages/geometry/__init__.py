@@ -1,7 +1,7 @@
 """Cameras, rigid transforms, pose errors and random poses: what every stage shares."""
 
 from stages.geometry.cameras import Camera, rays
-from stages.geometry.errors import rotation_error_deg, translation_error
+from stages.geometry.errors import rotation_error_deg, translation_error, viewing_angles
 from stages.geometry.rigid import (
     adjoint,
     camera_centre,
@@ -34,4 +34,5 @@ __all__ = [
     "rotation_error_deg",
     "translation_error",
     "twist_covariance",
+    "viewing_angles",
 ]

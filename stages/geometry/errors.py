@@ -1,4 +1,4 @@
-"""How far one pose is from another."""
+"""How far one pose is from another, and how differently they see."""
 
 from __future__ import annotations
 
@@ -17,3 +17,10 @@ def rotation_error_deg(cam_from_object_a: np.ndarray, cam_from_object_b: np.ndar
 def translation_error(cam_from_object_a: np.ndarray, cam_from_object_b: np.ndarray) -> float:
     """The distance between the two camera centres, in object units."""
     return float(np.linalg.norm(camera_centre(cam_from_object_a) - camera_centre(cam_from_object_b)))
+
+
+def viewing_angles(points: np.ndarray, cam_from_object_a: np.ndarray, cam_from_object_b: np.ndarray) -> np.ndarray:
+    """The angles (n,) in radians between the directions in which two cameras see points (n, 3) of the object."""
+    first, second = points - camera_centre(cam_from_object_a), points - camera_centre(cam_from_object_b)
+    cosine = (first * second).sum(axis=1) / np.linalg.norm(first, axis=1) / np.linalg.norm(second, axis=1)
+    return np.arccos(np.clip(cosine, -1, 1))

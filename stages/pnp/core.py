@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.geometry import Camera, camera_centre, twist_covariance
+from stages.geometry import Camera, twist_covariance, viewing_angles
 from stages.geometry.rigid import from_rotation
 from stages.pnp.config import PnpConfig
 from stages.pnp.least_squares import PoseFit, fit_pose, reprojection
@@ -73,13 +73,14 @@ def solve(
     if fit is None or inliers.sum() < config.min_inlier_ratio * len(pixels):
         return _failed("no_consensus", len(pixels))
     longer_side = max(camera.width, camera.height)
-    angle = 0.0 if seen_from is None else _angle_between_views(points[inliers], seen_from, fit.cam_from_object)
-    shared = config.shared_error + config.shared_error_by_angle * angle / inliers.mean()
+    pose = fit.cam_from_object
+    angles = viewing_angles(points[inliers], pose if seen_from is None else seen_from, pose)
+    shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles) / inliers.mean())
     covariance = twist_covariance(fit.jacobian, fit.weights, pixels[inliers], longer_side, fit.variance, shared)
     if not _plausible(covariance, pixels[inliers], longer_side, config):
         return _failed("implausible_pose", len(pixels))
     rms = float(np.sqrt((fit.residuals_px**2).sum(axis=1).mean()))
-    return PnpResult(True, "ok", fit.cam_from_object, inliers, rms, covariance)
+    return PnpResult(True, "ok", pose, inliers, rms, covariance)
 
 
 def _failed(reason: str, count: int) -> PnpResult:
@@ -128,13 +129,6 @@ def _polish(
         fit = fit_pose(pixels[inliers], points[inliers], camera, pose, weights[inliers])
         pose = fit.cam_from_object
     return fit, inliers
-
-
-def _angle_between_views(points: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
-    """The median angle in radians between the directions in which two poses (4, 4) see points (n, 3)."""
-    one, other = points - camera_centre(first), points - camera_centre(second)
-    cosine = (one * other).sum(axis=1) / np.linalg.norm(one, axis=1) / np.linalg.norm(other, axis=1)
-    return float(np.median(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def _plausible(covariance: np.ndarray, inlier_pixels: np.ndarray, longer_side: int, config: PnpConfig) -> bool:

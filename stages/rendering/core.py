@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry import Camera, camera_centre, rays
+from stages.geometry import Camera, rays, viewing_angles
 from stages.nerf.rendering_api import RayRenderer, RenderedView
 from stages.rendering.config import RenderingConfig
 
@@ -108,9 +108,7 @@ def _difference(cached: _Cached, cam_from_object: np.ndarray) -> tuple[float, fl
     if len(now) == 0 or not np.isfinite(now).all():
         return np.inf, np.inf
     shift = np.sqrt(((now - before) ** 2).sum(axis=1).mean()) / max(camera.width, camera.height)
-    first, second = cached.probes - camera_centre(old), cached.probes - camera_centre(cam_from_object)
-    cosine = (first * second).sum(axis=1) / np.linalg.norm(first, axis=1) / np.linalg.norm(second, axis=1)
-    return float(np.rad2deg(np.median(np.arccos(np.clip(cosine, -1, 1))))), float(shift)
+    return float(np.rad2deg(np.median(viewing_angles(cached.probes, old, cam_from_object)))), float(shift)
 
 
 def _view_id(field_id: str, camera: Camera, cam_from_object: np.ndarray) -> str:

@@ -12,6 +12,7 @@ from stages.geometry import (
     rotation_about,
     rotation_error_deg,
     translation_error,
+    viewing_angles,
 )
 from stages.geometry.rigid import from_rotation
 
@@ -61,3 +62,17 @@ def test_perturb_fills_its_limits_and_repeats_with_its_seed() -> None:
     assert min(shifts) < 0.01
     assert 0.19 < max(shifts) <= 0.2
     np.testing.assert_array_equal(guesses[0], perturb(POSE, np.random.default_rng(3)))
+
+
+@given(seeds, st.floats(0, 180))
+def test_viewing_angles_are_those_of_cameras_around_a_point(seed: int, angle_deg: float) -> None:
+    """Turned about the axis through a point, cameras at right angles to it see the point from that angle."""
+    rng = np.random.default_rng(seed)
+    centre, radius = rng.uniform(-1, 1, 3), rng.uniform(2, 5)
+    angle = np.deg2rad(angle_deg)
+    eyes = [centre + radius * np.array((np.cos(a), np.sin(a), 0)) for a in (0.0, angle)]
+    first, second = (look_at(eye, (0, 0, 0.1), (0, 0, 1)) for eye in eyes)
+    seen = viewing_angles(centre[None], first, second)
+    assert seen == pytest.approx([angle], abs=1e-6)
+    assert viewing_angles(centre[None], second, first) == pytest.approx(seen, abs=1e-6)
+    assert viewing_angles(centre[None], first, first) == pytest.approx([0], abs=1e-6)

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from rich.progress import track
 from rich.table import Table
 
 from deploy.errors import UsageError
-from deploy.output import check_writable, progress_console, result_console, write_json
+from deploy.output import check_writable, result_console, write_json
 from deploy.settings import Settings
 
 if TYPE_CHECKING:
-    from deploy.evaluation.methods import Finder
-    from deploy.evaluation.pairs import Pair, Protocol
+    from deploy.evaluation.occlusion import DrawThing
+    from deploy.evaluation.pairs import Protocol
     from deploy.evaluation.scores import Answer
     from deploy.evaluation.surface import Surface
     from stages.nerf.datasets import Dataset
@@ -84,9 +82,11 @@ class Options:
     def run(self) -> int:
         """Evaluate, print the table."""
         from deploy.evaluation import pairs
+        from deploy.evaluation.running import Examination, shown
         from stages.nerf.datasets import load_dataset
         from stages.nerf.field import load_field
         from stages.nerf.loading import make_renderer, warm_up
+        from stages.tracking.views import training_views
 
         check_writable(self.json, self.plot)
         self._check()
@@ -96,7 +96,8 @@ class Options:
         dataset, surface = load_dataset(self.dataset, "test", self.size), self._surface(field, renderer)
         protocol = self._protocol(surface)
         drawn = pairs.draw(protocol, [record.cam_from_object for record in dataset.images], self.seeds)
-        images, covered = self._images(dataset, drawn, protocol)
+        images, covered = shown(dataset, drawn, self._thing(protocol))
+        examination = Examination(renderer, training_views(field.metadata), dataset, images, drawn)
         warm_up(renderer, jacobian=True)
         about = {
             "protocol": dataclasses.asdict(protocol),
@@ -108,7 +109,7 @@ class Options:
         }
         answers: dict[str, Sequence[Answer]] = {}
         for name in names:
-            answers[name] = list(self._answers(name, field, renderer, dataset, images, drawn))
+            answers[name] = list(examination.answers(name, self.settings, self.slow_pairs))
             figures = {**about, **_scores(answers, surface)}
             write_json(self.json, figures)
         self._draw(answers, surface)
@@ -166,48 +167,14 @@ class Options:
             return None
         return surface_of(renderer, field.metadata.cameras, np.random.default_rng(0))
 
-    def _images(
-        self, dataset: Dataset, drawn: Sequence[Pair], protocol: Protocol
-    ) -> tuple[Mapping[tuple[int, int], np.ndarray], float | None]:
-        """Images by (seed, place), and the share of their pixels that is covered."""
-        from deploy.evaluation.occlusion import objects_of, occluded, painted
+    def _thing(self, protocol: Protocol) -> DrawThing | None:
+        """What is pasted over the images."""
+        from deploy.evaluation.occlusion import objects_of, painted
         from stages.nerf.datasets import load_dataset
 
-        images = {(pair.seed, pair.image): dataset.load_rgb(pair.image) for pair in drawn}
         if not protocol.occluded:
-            return images, None
-        thing = painted if self.occluders is None else objects_of(load_dataset(self.occluders, "test", self.size))
-        covered = {key: occluded(image, np.random.default_rng(key), thing) for key, image in images.items()}
-        share = float(np.mean([hidden.mean() for _, hidden in covered.values()]))
-        return {key: image for key, (image, _) in covered.items()}, share
-
-    def _answers(
-        self,
-        name: str,
-        field: Field,
-        renderer: RayRenderer,
-        dataset: Dataset,
-        images: Mapping[tuple[int, int], np.ndarray],
-        drawn: Sequence[Pair],
-    ) -> Iterator[Answer]:
-        """A method's answers, each from a fresh start."""
-        from deploy.evaluation.methods import METHODS
-        from deploy.evaluation.scores import Answer
-        from stages.tracking.views import training_views
-
-        method = METHODS[name]
-        finder: Finder = method.make(renderer, self.settings, training_views(field.metadata))
-        if method.slow and 0 < self.slow_pairs < len(drawn):
-            drawn = [drawn[i * len(drawn) // self.slow_pairs] for i in range(self.slow_pairs)]
-        if not method.slow:  # networks are slow the first time
-            last = drawn[-1]
-            finder.find(images[last.seed, last.image], dataset.images[last.image].camera, last.guess)
-        for pair in track(drawn, description=name, console=progress_console()):
-            image, camera = images[pair.seed, pair.image], dataset.images[pair.image].camera
-            began = time.perf_counter()
-            found = finder.find(image, camera, pair.guess)
-            seconds = time.perf_counter() - began
-            yield Answer(pair, found.cam_from_object, found.covariance, seconds, method.scale_known)
+            return None
+        return painted if self.occluders is None else objects_of(load_dataset(self.occluders, "test", self.size))
 
     def _draw(self, answers: Mapping[str, Sequence[Answer]], surface: Surface | None) -> None:
         from deploy.evaluation.plots import plot_reach, plot_success

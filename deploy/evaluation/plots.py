@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -16,19 +17,20 @@ from deploy.evaluation.scores import DIMENSIONS, Answer, curve
 Answers = Mapping[str, Sequence[Answer]]
 
 _BINS = 9
+_COLOURS = 10
 
 
 def plot_success(answers: Answers, path: Path, title: str) -> None:
     """Share of pairs below each error, and share of true poses inside each ellipsoid, by method."""
-    drawing, axes = plt.subplots(1, 3, figsize=(14, 4), layout="constrained")
+    drawing, axes = plt.subplots(1, 3, figsize=(14, 4.6), layout="constrained")
     limits = (np.geomspace(0.01, 180, 200), np.geomspace(1e-4, 10, 200))
     for which, (axis, label) in enumerate(zip(axes, ("rotation error, degrees", "translation error"), strict=False)):
-        for i, (name, given) in enumerate(answers.items()):
+        for name, given in answers.items():
             if which == 0 or all(answer.scale_known for answer in given):
-                axis.semilogx(limits[which], curve(given, which, limits[which]), label=name, color=f"C{i}")
+                axis.semilogx(limits[which], curve(given, which, limits[which]), label=name, **_style(answers, name))
         _framed(axis, label, "share of pairs below")
     _calibration(axes[2], answers)
-    axes[0].legend(loc="upper left", fontsize=8)
+    drawing.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=9)
     _save(drawing, path, title)
 
 
@@ -42,11 +44,17 @@ def plot_reach(answers: Answers, path: Path, title: str, diameter: float | None)
         for name, given in answers.items():
             if all(answer.scale_known for answer in given):
                 middles, shares = _binned([a for a in given if _turned(a) == (which == 0)], which, unit)
-                axes[which].plot(middles, shares, marker="o", markersize=4, label=name)
+                axes[which].plot(middles, shares, marker="o", markersize=4, label=name, **_style(answers, name))
     _framed(axes[0], "turn of the guess, degrees", "share of right poses")
     _framed(axes[1], f"shift of the guess, {'object diameters' if diameter else 'units'}", "share of right poses")
-    axes[0].legend(loc="lower left", fontsize=8)
+    drawing.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=9)
     _save(drawing, path, title)
+
+
+def _style(answers: Answers, name: str) -> dict[str, Any]:
+    """A colour of its own for each of ten methods, and dashes for those beyond."""
+    place = list(answers).index(name)
+    return {"color": f"C{place % _COLOURS}", "linestyle": "-" if place < _COLOURS else "--"}
 
 
 def _turned(answer: Answer) -> bool:
@@ -66,11 +74,11 @@ def _binned(answers: Sequence[Answer], which: int, unit: float) -> tuple[list[fl
 def _calibration(axis: Axes, answers: Answers) -> None:
     probabilities = np.linspace(0, 1, 101)
     axis.plot([0, 1], [0, 1], color="black", linewidth=0.8, linestyle="--")
-    for i, (name, given) in enumerate(answers.items()):
+    for name, given in answers.items():
         squared = np.array([d for answer in given if (d := answer.mahalanobis_squared) is not None])
         if len(squared):
             inside = [(squared <= limit).mean() for limit in chi2.ppf(probabilities, DIMENSIONS)]
-            axis.plot(probabilities, inside, label=name, color=f"C{i}")
+            axis.plot(probabilities, inside, label=name, **_style(answers, name))
     _framed(axis, "probability of the ellipsoid", "share of true poses inside")
 
 

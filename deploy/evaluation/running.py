@@ -1,0 +1,70 @@
+"""Methods at work: images that they are shown, and the answers that they give."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rich.progress import track
+
+from deploy.evaluation.methods import METHODS
+from deploy.evaluation.occlusion import DrawThing, occluded
+from deploy.evaluation.pairs import Pair
+from deploy.evaluation.scores import Answer
+from deploy.output import progress_console
+from deploy.settings import Settings
+from stages.geometry import Camera
+from stages.nerf.datasets import Dataset
+from stages.nerf.rendering_api import RayRenderer
+from stages.tracking.views import TrainingViews
+
+
+@dataclass(frozen=True)
+class Examination:
+    """A field, and the pairs of a dataset's images and guesses that methods are asked for.
+
+    images: (h, w, 3) uint8 by (seed, place in the dataset).
+    """
+
+    renderer: RayRenderer
+    views: TrainingViews
+    dataset: Dataset
+    images: Mapping[tuple[int, int], np.ndarray]
+    pairs: Sequence[Pair]
+
+    def answers(self, name: str, settings: Settings, slow_pairs: int) -> Iterator[Answer]:
+        """A method's answers; a slow one gets only `slow_pairs` of the pairs, evenly spread (0: all)."""
+        method = METHODS[name]
+        finder = method.make(self.renderer, settings, self.views)
+        pairs = _spread(self.pairs, slow_pairs) if method.slow else self.pairs
+        if not method.slow:  # networks are slow the first time
+            finder.find(*self._question(pairs[-1]))
+        for pair in track(pairs, description=name, console=progress_console()):
+            question = self._question(pair)
+            began = time.perf_counter()
+            found = finder.find(*question)
+            seconds = time.perf_counter() - began
+            yield Answer(pair, found.cam_from_object, found.covariance, seconds, method.scale_known)
+
+    def _question(self, pair: Pair) -> tuple[np.ndarray, Camera, np.ndarray]:
+        return self.images[pair.seed, pair.image], self.dataset.images[pair.image].camera, pair.guess
+
+
+def shown(
+    dataset: Dataset, pairs: Sequence[Pair], thing: DrawThing | None
+) -> tuple[dict[tuple[int, int], np.ndarray], float | None]:
+    """Images by (seed, place in the dataset), and the mean share of them that is covered where things are pasted."""
+    images = {(pair.seed, pair.image): dataset.load_rgb(pair.image) for pair in pairs}
+    if thing is None:
+        return images, None
+    covered = {key: occluded(image, np.random.default_rng(key), thing) for key, image in images.items()}
+    share = float(np.mean([hidden.mean() for _, hidden in covered.values()]))
+    return {key: image for key, (image, _) in covered.items()}, share
+
+
+def _spread(pairs: Sequence[Pair], count: int) -> Sequence[Pair]:
+    if not 0 < count < len(pairs):
+        return pairs
+    return [pairs[i * len(pairs) // count] for i in range(count)]

@@ -15,6 +15,10 @@ class PnpConfig:
     """at most so many samples of three points"""
     confidence: float = 0.99999
     """RANSAC stops when a better pose would have been seen with this probability"""
+    runs: int = 3
+    """RANSAC runs so often, from other samples, while fewer than many_inliers agree; the best run counts"""
+    many_inliers: int = 60
+    """see runs"""
     min_inliers: int = 8
     """fewer inliers are no pose"""
     min_inlier_ratio: float = 0.08

@@ -63,7 +63,7 @@ def solve(
     pixels += (plain.cx, plain.cy)
     points = points_in_object.astype(np.float64)
     threshold = config.threshold_px * max(camera.width, camera.height) / _REFERENCE_SIDE_PX
-    start = _ransac(pixels, points, plain, threshold, config)
+    start = best_start(pixels, points, plain, threshold, config)
     if start is None:
         return _failed("no_consensus", len(pixels))
     weights = np.ones(len(pixels))
@@ -87,8 +87,29 @@ def _failed(reason: str, count: int) -> PnpResult:
     return PnpResult(False, reason, None, np.zeros(count, bool), None, None)
 
 
-def _ransac(
+def best_start(
     pixels: np.ndarray, points: np.ndarray, camera: Camera, threshold: float, config: PnpConfig
+) -> np.ndarray | None:
+    """The pose that correspondences agree on best; one that few agree on is compared with those of further runs.
+
+    pixels (n, 2) and points (n, 3) float64, the camera without distortion; None where no run finds a pose.
+    """
+    best, least = None, np.inf
+    for run in range(config.runs):
+        pose = _ransac(pixels, points, camera, threshold, config, config.seed + run)
+        if pose is None:
+            continue
+        lengths = np.linalg.norm(reprojection(pixels, points, camera, pose)[0], axis=1)
+        cost = float((np.minimum(lengths, threshold) ** 2).sum())
+        if cost < least:
+            best, least = pose, cost
+        if np.count_nonzero(lengths <= threshold) >= config.many_inliers:
+            break
+    return best
+
+
+def _ransac(
+    pixels: np.ndarray, points: np.ndarray, camera: Camera, threshold: float, config: PnpConfig, seed: int
 ) -> np.ndarray | None:
     """A pose that many correspondences agree on, or None."""
     params = cv2.UsacParams()
@@ -97,7 +118,7 @@ def _ransac(
     params.sampler = cv2.SAMPLING_UNIFORM
     params.final_polisher = cv2.LSQ_POLISHER
     params.threshold, params.confidence = threshold, config.confidence
-    params.maxIterations, params.randomGeneratorState = config.iterations, config.seed
+    params.maxIterations, params.randomGeneratorState = config.iterations, seed
     try:
         found, _, turn, shift, _ = cv2.solvePnPRansac(points, pixels, camera.matrix(), None, params=params)
     except cv2.error:  # its solvers raise for degenerate points

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from scipy import stats
 
 from bus.messages import Reason
 from stages.geometry import Camera, exp_se3, inverse, log_se3, look_at, rotation_error_deg, translation_error
-from stages.pnp.core import PnpConfig, PnpResult, solve
+from stages.pnp.core import PnpConfig, PnpResult, best_start, solve
 from stages.pnp.least_squares import reprojection
 
 Maker = Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]
@@ -169,3 +170,20 @@ def test_the_derivative_is_by_the_left_twist() -> None:
         ahead, _ = reprojection(pixels, points, CAMERA, exp_se3(step) @ POSE)
         behind, _ = reprojection(pixels, points, CAMERA, exp_se3(-step) @ POSE)
         np.testing.assert_allclose(jacobian[:, :, axis], (ahead - behind) / 2e-6, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_best_of_several_runs_agrees_best(seed: int) -> None:
+    pixels, points, _ = problem(np.random.default_rng(seed), 120, 0.8, 0.8)
+    config = PnpConfig(iterations=200)
+
+    def cost(pose: np.ndarray | None) -> float:
+        assert pose is not None
+        lengths = np.linalg.norm(reprojection(pixels, points, CAMERA, pose)[0], axis=1)
+        return float((np.minimum(lengths, 3.0) ** 2).sum())
+
+    pixels, points = pixels.astype(np.float64), points.astype(np.float64)
+    alone = [best_start(pixels, points, CAMERA, 3.0, replace(config, seed=run, runs=1)) for run in range(3)]
+    assert cost(best_start(pixels, points, CAMERA, 3.0, config)) == min(cost(pose) for pose in alone)
+    sure = replace(config, many_inliers=1)
+    assert cost(best_start(pixels, points, CAMERA, 3.0, sure)) == cost(alone[0])

@@ -42,7 +42,7 @@ class ScoreConfig:
     """A pose that scores less is not used."""
     good: float = 0.4
     """What it takes to trust tracking again after it was limited or lost."""
-    sure: float = 0.7
+    sure: float = 0.9
     """What it takes to believe the pose of an image that stands by itself before another pass has found it again."""
 
 

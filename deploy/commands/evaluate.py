@@ -35,9 +35,10 @@ class Options:
     nerf-synthetic: 5 images, 5 guesses each, turned by 10 to 40 degrees about the origin and shifted by up to 0.2;
     llff: up to 40 degrees and 0.1; occluded: the same, with things pasted over a part of the image; reach: alternately
     turned by up to 180 degrees or shifted by up to the object's diameter. The same seed gives the same pairs for
-    every method. The JSON file has (it is written after each method): protocol, unit, pairs, seeds, covered,
-    diameter, methods (name -> pairs,
-    share_re_below_5deg, share_te_below_0.05, share_both_below, share_ok, share_ok_right, share_of_solvable,
+    every method; slow ones get a part of them (--slow-pairs).
+
+    The JSON file, written after each method, has: protocol, unit, pairs, seeds, covered, diameter, methods (name ->
+    pairs, share_re_below_5deg, share_te_below_0.05, share_both_below, share_ok, share_ok_right, share_of_solvable,
     mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te, seconds_per_image, covariance, add),
     differences (name -> than, and the mean and 95 % interval of how much larger its errors are than that method's,
     also with errors capped at 20 degrees and 0.2, a missing pose being so wrong).

@@ -67,7 +67,7 @@ def _published(name: str, *, slow: bool = True, scale_known: bool = True, **conf
 
 
 def _one_step(settings: Settings) -> Settings:
-    return _passes(replace(settings, tracking=replace(settings.tracking, passes=1)))
+    return _passes(_refined_step(settings))
 
 
 def _passes(settings: Settings) -> Settings:
@@ -108,6 +108,6 @@ METHODS: dict[str, Method] = {
 pixels around the keypoints or, -anywhere, of the whole image, -adam, by the paper's 40 steps of Adam; passes: up to
 tracking.passes of them, from other guesses where the first leads nowhere; full: those and refinement. essential:
 rotations from matches alone; inerf, -2048: with so many rays a step; pi-nerf, -camera: turned about the camera and
-drawn less widely, as published; these five are in tests/benchmark/baselines."""
+drawn less widely, closer to its publication; these five are in tests/benchmark/baselines."""
 
 DEFAULT = ("one-step", "one-step-unmined", "passes", "full")

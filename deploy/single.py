@@ -15,7 +15,7 @@ from stages.geometry import Camera
 from stages.lifting.core import Lifted, lift
 from stages.matching.core import PairMatcher, build_matcher
 from stages.nerf.rendering_api import RayRenderer
-from stages.pnp.core import PnpResult, solve
+from stages.pnp.core import Pictures, PnpResult, solve
 from stages.refinement.core import RefinementResult, refine
 from stages.rendering.core import SourcedView, ViewSource
 from stages.tracking.frame_policies import EachFramePolicy
@@ -96,13 +96,18 @@ class PoseFinder:
             return PoseFound(Reason.TOO_FEW_CONSISTENT_POINTS, stage_ms=clock.ms)
         pixels, points, confidence = matched.pixels_b[kept], lifted.points_in_object[kept], matched.confidence[kept]
         seen_from = view.cam_from_object
-        solved = clock.time("pnp", lambda: solve(pixels, points, camera, self._settings.pnp, confidence, seen_from))
+        pictures = Pictures(view.rgb, view.depth, view.camera, seen_from, image)
+        solved = clock.time(
+            "pnp", lambda: solve(pixels, points, camera, self._settings.pnp, confidence, seen_from, pictures)
+        )
         if solved.cam_from_object is None:
             return PoseFound(Reason(solved.reason), correspondences=len(pixels), stage_ms=clock.ms)
         pose = solved.cam_from_object
         refined = clock.time(
             "refinement",
-            lambda: refine(self._renderer, image, camera, pose, pixels[solved.inliers], rng, self._settings.refinement),
+            lambda: refine(
+                self._renderer, image, camera, pose, solved.inliers_in_frame, rng, self._settings.refinement
+            ),
         )
         return _found(solved, refined, len(pixels), clock.ms)
 

@@ -7,10 +7,14 @@ parabola through the heatmap's peak places them between pixels.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
+import cv2
 import numpy as np
 import torch
 from kornia.feature import XFeatModel
 from torch.nn import functional
+from torch.nn.utils import fuse_conv_bn_eval
 
 from stages.matching.core import Features, MatchedPixels, MatchingConfig
 from stages.matching.weights import WeightsFile, find_weights, load_network
@@ -31,7 +35,8 @@ class XFeatExtractor:
 
     def __init__(self, config: MatchingConfig) -> None:
         path = find_weights(WEIGHTS, config.weights, config.allow_download)
-        self._network = load_network(XFeatModel(), path, config.device)
+        network = _without_norms(load_network(XFeatModel(), path, config.device))
+        self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._max_keypoints, self._device = config.max_keypoints, config.device
 
     @torch.inference_mode()
@@ -55,8 +60,9 @@ class XFeatExtractor:
 
     def _peaks(self, heat: torch.Tensor, reliability: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The strongest pixels (x, y) that are maxima of their 5 x 5 neighbourhood."""
-        peaks = (heat == functional.max_pool2d(heat, 5, 1, 2)) & (heat > _MIN_HEAT)
-        y, x = peaks[0, 0].nonzero(as_tuple=True)
+        values = heat[0, 0].cpu().numpy()
+        peaks = (values == cv2.dilate(values, np.ones((5, 5), np.uint8))) & (values > _MIN_HEAT)
+        y, x = (torch.from_numpy(places).to(heat.device) for places in np.nonzero(peaks))
         score = heat[0, 0, y, x] * _sample(reliability, x, y, heat.shape, "bilinear")[:, 0]
         best = torch.topk(score, min(self._max_keypoints, len(score))).indices
         return x[best], y[best]
@@ -90,6 +96,17 @@ def mutual_nearest(first: torch.Tensor, second: torch.Tensor) -> tuple[np.ndarra
     backward = similarity.argmax(0)
     mutual = (backward[forward] == torch.arange(len(first), device=first.device)).nonzero()[:, 0]
     return mutual.cpu().numpy(), forward[mutual].cpu().numpy(), cosine[mutual].cpu()
+
+
+def _without_norms(network: torch.nn.Module) -> torch.nn.Module:
+    """The network with each normalisation by constants taken into the convolution before it."""
+    for layer in network.modules():
+        parts = dict(layer.named_children())
+        for (before, first), (after, second) in pairwise(parts.items()):
+            if isinstance(first, torch.nn.Conv2d) and isinstance(second, torch.nn.BatchNorm2d):
+                setattr(layer, before, fuse_conv_bn_eval(first, second))
+                setattr(layer, after, torch.nn.Identity())
+    return network
 
 
 def _sample(values: torch.Tensor, x: torch.Tensor, y: torch.Tensor, shape: torch.Size, mode: str) -> torch.Tensor:

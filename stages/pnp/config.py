@@ -15,10 +15,8 @@ class PnpConfig:
     """at most so many samples of three points"""
     confidence: float = 0.99999
     """RANSAC stops when a better pose would have been seen with this probability"""
-    runs: int = 3
-    """RANSAC runs so often, from other samples, while fewer than many_inliers agree; the best run counts"""
-    many_inliers: int = 60
-    """see runs"""
+    least_iterations: int = 500
+    """at least so many"""
     min_inliers: int = 8
     """fewer inliers are no pose"""
     min_inlier_ratio: float = 0.08
@@ -34,5 +32,16 @@ class PnpConfig:
     shared_error_by_angle: float = 0.6
     """what is added to it for each radian between the directions of view, divided by the share of inliers: features
     move on surfaces that are seen from elsewhere, and a small consensus holds matches that agree by chance"""
+    align_levels: int = 3
+    """points are then looked for in the frame by the patches around them, from patches coarsened so often, each time
+    by 2, down to fine ones; 0: matched pixels are taken as they are"""
+    align_half: int = 4
+    """a patch has this many samples to either side of its middle"""
+    align_steps: int = 8
+    """at most so many steps to find a patch"""
+    align_similarity: float = 0.75
+    """patches that correlate less are not found"""
+    align_px: float = 1.5
+    """largest reprojection error of a point that was found, in pixels of the view"""
     seed: int = 0
     """of RANSAC's samples"""

@@ -1,23 +1,22 @@
 """The pose from correspondences between pixels of a frame and points of the object: RANSAC, refinement, checks.
 
 Sources: Fischler and Bolles, Random sample consensus (1981); Chum, Matas and Kittler, Locally optimized RANSAC
-(2003), both in OpenCV's implementation.
+(2003), both as PoseLib has them.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
+import poselib
 
-from stages.geometry import Camera, twist_covariance, viewing_angles
-from stages.geometry.rigid import from_rotation
+from stages.geometry import Camera, is_rigid, twist_covariance, viewing_angles
+from stages.pnp.alignment import Aligner, Pictures
 from stages.pnp.config import PnpConfig
 from stages.pnp.least_squares import PoseFit, fit_pose, reprojection
 
-__all__ = ["PnpConfig", "PnpResult", "solve"]
+__all__ = ["Pictures", "PnpConfig", "PnpResult", "solve"]
 
 _MIN_POINTS = 4
 _ROUNDS = 3
@@ -27,18 +26,29 @@ _REFERENCE_SIDE_PX = 400
 
 @dataclass(frozen=True)
 class PnpResult:
-    """ok and a reason that is a value of bus.messages.Reason; the rest is None, and inliers false, where not ok.
+    """ok and a reason that is a value of bus.messages.Reason; the rest is None, or nothing, where not ok.
 
-    inliers: (n,) bool.  residual_px: root mean square over the inliers.  covariance: (6, 6) of the left twist
-    (translation, rotation) of cam_from_object, in the object's unit and radians.
+    inliers: (n,) bool.  inliers_in_frame: (m, 2) float32, their pixels as matched, or as found in the frame since.
+    residual_px: root mean square over the inliers.  covariance: (6, 6) of the left twist (translation, rotation) of
+    cam_from_object, in the object's unit and radians.
     """
 
     ok: bool
     reason: str
     cam_from_object: np.ndarray | None
     inliers: np.ndarray
+    inliers_in_frame: np.ndarray
     residual_px: float | None
     covariance: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class _Consensus:
+    """A pose and what agrees on it: `index` (m,) of the correspondences, their pixels (m, 2) in the frame."""
+
+    fit: PoseFit
+    index: np.ndarray
+    pixels: np.ndarray
 
 
 def solve(
@@ -48,84 +58,95 @@ def solve(
     config: PnpConfig | None = None,
     confidence: np.ndarray | None = None,
     seen_from: np.ndarray | None = None,
+    pictures: Pictures | None = None,
 ) -> PnpResult:
     """The camera's pose from pixels (n, 2), distorted as the camera has them, and points (n, 3) in the object.
 
     confidence (n,), relative to each other, counts in the refinement and not in RANSAC. seen_from (4, 4): the pose of
-    the view that gave the points; the further it is from the pose found, the less certain is that. The same input
-    gives the same result. Never raises for data that hold no pose: the result says why.
+    the view that gave the points; the further it is from the pose found, the less certain is that. pictures: that view
+    and the frame; with them all points are looked for anew near where RANSAC's pose puts them, whatever they were
+    matched with. The same input gives the same result. Never raises for data that hold no pose: the result says why.
     """
     config = config or PnpConfig()
-    if len(pixels_in_frame) < max(config.min_inliers, _MIN_POINTS):
-        return _failed("too_few_consistent_points", len(pixels_in_frame))
-    plain = camera.undistorted()
-    pixels = camera.directions(pixels_in_frame)[:, :2].astype(np.float64) * (plain.fx, plain.fy)
-    pixels += (plain.cx, plain.cy)
+    count, longer_side = len(pixels_in_frame), max(camera.width, camera.height)
+    if count < max(config.min_inliers, _MIN_POINTS):
+        return _failed("too_few_consistent_points", count)
     points = points_in_object.astype(np.float64)
+    found = _agreed(pixels_in_frame, points, camera, confidence, config)
+    if found is None:
+        return _failed("no_consensus", count)
+    if pictures is not None and config.align_levels > 0:
+        found = _aligned(found, Aligner(pictures, points, camera, config), points, camera, config)
+    fit, pose = found.fit, found.fit.cam_from_object
+    angles = viewing_angles(points[found.index], pose if seen_from is None else seen_from, pose)
+    shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles) * count / len(found.index))
+    covariance = twist_covariance(fit.jacobian, fit.weights, found.pixels, longer_side, fit.variance, shared)
+    if not _plausible(covariance, found.pixels, longer_side, config):
+        return _failed("implausible_pose", count)
+    inliers, in_frame = np.zeros(count, bool), found.pixels.astype(np.float32)
+    inliers[found.index] = True
+    rms = float(np.sqrt((fit.residuals_px**2).sum(axis=1).mean()))
+    return PnpResult(True, "ok", pose, inliers, in_frame, rms, covariance)
+
+
+def _failed(reason: str, count: int) -> PnpResult:
+    return PnpResult(False, reason, None, np.zeros(count, bool), np.zeros((0, 2), np.float32), None, None)
+
+
+def _agreed(
+    pixels_in_frame: np.ndarray, points: np.ndarray, camera: Camera, confidence: np.ndarray | None, config: PnpConfig
+) -> _Consensus | None:
+    """The pose that most matches agree on, fitted to these; None where too few do."""
+    pixels, plain = _ideal(pixels_in_frame, camera), camera.undistorted()
     threshold = config.threshold_px * max(camera.width, camera.height) / _REFERENCE_SIDE_PX
     start = best_start(pixels, points, plain, threshold, config)
     if start is None:
-        return _failed("no_consensus", len(pixels))
+        return None
     weights = np.ones(len(pixels))
     if confidence is not None:
         weights = np.maximum(confidence.astype(np.float64), _LEAST_CONFIDENCE) ** config.confidence_power
     fit, inliers = _polish(pixels, points, plain, start, weights, threshold, config)
     if fit is None or inliers.sum() < config.min_inlier_ratio * len(pixels):
-        return _failed("no_consensus", len(pixels))
-    longer_side = max(camera.width, camera.height)
-    pose = fit.cam_from_object
-    angles = viewing_angles(points[inliers], pose if seen_from is None else seen_from, pose)
-    shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles) / inliers.mean())
-    covariance = twist_covariance(fit.jacobian, fit.weights, pixels[inliers], longer_side, fit.variance, shared)
-    if not _plausible(covariance, pixels[inliers], longer_side, config):
-        return _failed("implausible_pose", len(pixels))
-    rms = float(np.sqrt((fit.residuals_px**2).sum(axis=1).mean()))
-    return PnpResult(True, "ok", pose, inliers, rms, covariance)
+        return None
+    return _Consensus(fit, np.flatnonzero(inliers), pixels_in_frame[inliers])
 
 
-def _failed(reason: str, count: int) -> PnpResult:
-    return PnpResult(False, reason, None, np.zeros(count, bool), None, None)
+def _aligned(found: _Consensus, aligner: Aligner, points: np.ndarray, camera: Camera, config: PnpConfig) -> _Consensus:
+    """The pose by where the points are found in the frame, from round to round; as it was where too few are."""
+    for level, spread_px in aligner.rounds():
+        placed = aligner.place(found.fit.cam_from_object, level)
+        pixels, ones = _ideal(placed.pixels, camera), np.ones(len(placed.index))
+        fit, inliers = _polish(
+            pixels, points[placed.index], camera.undistorted(), found.fit.cam_from_object, ones, spread_px, config
+        )
+        if fit is None:
+            break
+        found = _Consensus(fit, placed.index[inliers], placed.pixels[inliers])
+    return found
+
+
+def _ideal(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels (n, 2) float64 of the camera without distortion."""
+    return camera.directions(pixels)[:, :2].astype(np.float64) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
 def best_start(
     pixels: np.ndarray, points: np.ndarray, camera: Camera, threshold: float, config: PnpConfig
 ) -> np.ndarray | None:
-    """The pose that correspondences agree on best; one that few agree on is compared with those of further runs.
+    """The pose that most correspondences agree on, or None.
 
-    pixels (n, 2) and points (n, 3) float64, the camera without distortion; None where no run finds a pose.
+    pixels (n, 2) and points (n, 3) float64, the camera without distortion.
     """
-    best, least = None, np.inf
-    for run in range(config.runs):
-        pose = _ransac(pixels, points, camera, threshold, config, config.seed + run)
-        if pose is None:
-            continue
-        lengths = np.linalg.norm(reprojection(pixels, points, camera, pose)[0], axis=1)
-        cost = float((np.minimum(lengths, threshold) ** 2).sum())
-        if cost < least:
-            best, least = pose, cost
-        if np.count_nonzero(lengths <= threshold) >= config.many_inliers:
-            break
-    return best
-
-
-def _ransac(
-    pixels: np.ndarray, points: np.ndarray, camera: Camera, threshold: float, config: PnpConfig, seed: int
-) -> np.ndarray | None:
-    """A pose that many correspondences agree on, or None."""
-    params = cv2.UsacParams()
-    params.score = cv2.SCORE_METHOD_MSAC
-    params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
-    params.sampler = cv2.SAMPLING_UNIFORM
-    params.final_polisher = cv2.LSQ_POLISHER
-    params.threshold, params.confidence = threshold, config.confidence
-    params.maxIterations, params.randomGeneratorState = config.iterations, seed
-    try:
-        found, _, turn, shift, _ = cv2.solvePnPRansac(points, pixels, camera.matrix(), None, params=params)
-    except cv2.error:  # its solvers raise for degenerate points
-        return None
-    if not found or not np.all(np.isfinite(turn)) or not np.all(np.isfinite(shift)):
-        return None
-    return from_rotation(Rotation.from_rotvec(turn.ravel()), shift.ravel())
+    model = {"model": "PINHOLE", "width": camera.width, "height": camera.height}
+    intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
+    options = {
+        "max_reproj_error": threshold, "max_iterations": config.iterations,
+        "min_iterations": config.least_iterations, "success_prob": config.confidence, "seed": config.seed,
+    }  # fmt: skip
+    found, about = poselib.estimate_absolute_pose(pixels, points, {**model, "params": intrinsics}, options, {})
+    pose = np.eye(4)
+    pose[:3] = found.Rt
+    return pose if about["num_inliers"] >= _MIN_POINTS and is_rigid(pose) else None
 
 
 def _polish(

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from stages.geometry import Camera, exp_se3
 
 _MAX_STEPS = 20
-_CONVERGED = 1e-6
+_CONVERGED = 1e-5
 _HUBER = 1.345
 _MEDIAN_TO_SIGMA = 1.1774
 """The median length of a 2-D Gaussian of unit sigma is this; Huber's constant is for a known sigma."""
@@ -28,7 +30,7 @@ class PoseFit:
     def variance(self) -> float:
         """Of a residual of weight 1 as Huber's loss sees it; Huber, Robust Statistics (1981), section 7.6."""
         length = _lengths(self.residuals_px, self.weights)
-        delta = _huber_width(self.residuals_px, self.weights)
+        delta = _huber_width(length)
         freedom = max(2 * len(length) - 6, 1)
         slope = np.where(length <= delta, 1.0, delta / (2 * np.maximum(length, 1e-12))).mean()
         return float((np.minimum(length, delta) ** 2).sum() / freedom / slope**2)
@@ -42,20 +44,81 @@ def fit_pose(
     pixels (n, 2) of an undistorted camera, points (n, 3) in object coordinates, weights (n,) of squared errors.
     """
     pose, damping = cam_from_object, 1e-6
-    residuals, jacobian = reprojection(pixels, points, camera, pose)
+    pixels, points, weights = (np.ascontiguousarray(given, np.float64) for given in (pixels, points, weights))
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    lengths, moved_lengths = np.empty(len(points)), np.empty(len(points))
+    gradient, hessian = np.empty(6), np.empty((6, 6))
+    weighted_lengths(pixels, points, intrinsics, pose, weights, lengths)
     for _ in range(_MAX_STEPS):
-        delta = _huber_width(residuals, weights)
-        cost = _huber_cost(residuals, weights, delta)
-        step = _step(residuals, jacobian, weights * _huber_weights(residuals, weights, delta), damping)
+        delta = _huber_width(lengths)
+        normal_equations(pixels, points, intrinsics, pose, weights, delta, gradient, hessian)
+        hessian[np.diag_indices(6)] *= 1 + damping
+        step = -np.linalg.solve(hessian + 1e-12 * np.eye(6), gradient)
         moved = exp_se3(step) @ pose
-        new_residuals, new_jacobian = reprojection(pixels, points, camera, moved)
-        if _huber_cost(new_residuals, weights, delta) <= cost:
-            pose, residuals, jacobian, damping = moved, new_residuals, new_jacobian, damping / 10
+        weighted_lengths(pixels, points, intrinsics, moved, weights, moved_lengths)
+        if _huber_cost(moved_lengths, delta) <= _huber_cost(lengths, delta):
+            pose, damping = moved, damping / 10
+            lengths, moved_lengths = moved_lengths, lengths
         else:
             damping *= 100
         if np.linalg.norm(step) < _CONVERGED:
             break
-    return PoseFit(pose, residuals, jacobian, weights)
+    return PoseFit(pose, *reprojection(pixels, points, camera, pose), weights)
+
+
+@njit(nogil=True, cache=True)
+def weighted_lengths(
+    pixels: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray, weights: np.ndarray,
+    out: np.ndarray,
+) -> None:  # fmt: skip
+    """Reprojection errors out (n,), each times the root of its weight; infinite behind the camera. All float64."""
+    fx, fy, cx, cy = intrinsics
+    for i in range(points.shape[0]):
+        p0, p1, p2 = points[i]
+        z = pose[2, 0] * p0 + pose[2, 1] * p1 + pose[2, 2] * p2 + pose[2, 3]
+        if z <= 0:
+            out[i] = np.inf
+            continue
+        u = (pose[0, 0] * p0 + pose[0, 1] * p1 + pose[0, 2] * p2 + pose[0, 3]) / z
+        v = (pose[1, 0] * p0 + pose[1, 1] * p1 + pose[1, 2] * p2 + pose[1, 3]) / z
+        x, y = fx * u + cx - pixels[i, 0], fy * v + cy - pixels[i, 1]
+        out[i] = math.sqrt(weights[i] * (x * x + y * y))
+
+
+@njit(nogil=True, cache=True)
+def normal_equations(
+    pixels: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray, weights: np.ndarray,
+    delta: float, gradient: np.ndarray, hessian: np.ndarray,
+) -> None:  # fmt: skip
+    """Fill the gradient (6,) and Gauss-Newton's Hessian (6, 6) of Huber's loss by the left twist of a pose (4, 4).
+
+    `reprojection` has the residuals and derivatives; points behind the camera count for nothing.
+    """
+    fx, fy, cx, cy = intrinsics
+    gradient[:] = 0
+    hessian[:] = 0
+    rows = np.empty((2, 6))
+    for i in range(points.shape[0]):
+        p0, p1, p2 = points[i]
+        z = pose[2, 0] * p0 + pose[2, 1] * p1 + pose[2, 2] * p2 + pose[2, 3]
+        if z <= 0:
+            continue
+        u = (pose[0, 0] * p0 + pose[0, 1] * p1 + pose[0, 2] * p2 + pose[0, 3]) / z
+        v = (pose[1, 0] * p0 + pose[1, 1] * p1 + pose[1, 2] * p2 + pose[1, 3]) / z
+        x, y = fx * u + cx - pixels[i, 0], fy * v + cy - pixels[i, 1]
+        length = math.sqrt(weights[i] * (x * x + y * y))
+        weight = weights[i] * (1.0 if length <= delta else delta / length)
+        rows[0, 0], rows[0, 1], rows[0, 2] = fx / z, 0.0, -fx * u / z
+        rows[0, 3], rows[0, 4], rows[0, 5] = -fx * u * v, fx * (1 + u * u), -fx * v
+        rows[1, 0], rows[1, 1], rows[1, 2] = 0.0, fy / z, -fy * v / z
+        rows[1, 3], rows[1, 4], rows[1, 5] = -fy * (1 + v * v), fy * u * v, fy * u
+        for a in range(6):
+            gradient[a] += weight * (rows[0, a] * x + rows[1, a] * y)
+            for b in range(a + 1):
+                hessian[a, b] += weight * (rows[0, a] * rows[0, b] + rows[1, a] * rows[1, b])
+    for a in range(6):
+        for b in range(a):
+            hessian[b, a] = hessian[a, b]
 
 
 def reprojection(
@@ -76,25 +139,13 @@ def reprojection(
     return residuals, jacobian
 
 
-def _step(residuals: np.ndarray, jacobian: np.ndarray, weights: np.ndarray, damping: float) -> np.ndarray:
-    weighted = (weights[:, None, None] * jacobian).reshape(-1, 6)
-    hessian = weighted.T @ jacobian.reshape(-1, 6)
-    hessian[np.diag_indices(6)] *= 1 + damping
-    return -np.linalg.solve(hessian + 1e-12 * np.eye(6), weighted.T @ residuals.ravel())
-
-
 def _lengths(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.sqrt(weights) * np.linalg.norm(residuals, axis=1)
 
 
-def _huber_width(residuals: np.ndarray, weights: np.ndarray) -> float:
-    return max(_HUBER * float(np.median(_lengths(residuals, weights))) / _MEDIAN_TO_SIGMA, 1e-6)
+def _huber_width(lengths: np.ndarray) -> float:
+    return max(_HUBER * float(np.median(lengths)) / _MEDIAN_TO_SIGMA, 1e-6)
 
 
-def _huber_weights(residuals: np.ndarray, weights: np.ndarray, delta: float) -> np.ndarray:
-    return np.minimum(1.0, delta / np.maximum(_lengths(residuals, weights), 1e-12))
-
-
-def _huber_cost(residuals: np.ndarray, weights: np.ndarray, delta: float) -> float:
-    length = _lengths(residuals, weights)
-    return float(np.where(length <= delta, length**2, delta * (2 * length - delta)).sum())
+def _huber_cost(lengths: np.ndarray, delta: float) -> float:
+    return float(np.where(lengths <= delta, lengths**2, delta * (2 * lengths - delta)).sum())

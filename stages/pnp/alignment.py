@@ -1,0 +1,148 @@
+"""Placing lifted points in the frame by comparing the view with it, once the pose is nearly known.
+
+Features move on surfaces that are seen from elsewhere, and many are matched wrongly. A pose that RANSAC has found tells
+where every lifted point must be and how its surroundings are warped there, so that the patch around it in the view can
+be looked for in the frame: coarsely first, then to a fraction of a pixel. What is found gives a better pose, and the
+share that is found tells whether the pose is right at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from stages.geometry import Camera, inverse
+from stages.pnp.config import PnpConfig
+from stages.pnp.patches import find_patches
+
+_BLUR = 0.5
+_LOOSER = 1.4
+"""Errors before a round are larger than after the last by this and by how coarse the round is."""
+_FLATTEST, _STEEPEST = 0.15, 6.0
+"""Patches that cover less or more of the frame than these shares of themselves are seen too differently."""
+_BASELINE_PX = 2
+_NO_SURFACE = np.float32(1e3)
+_HALF_PX = np.array([[0.0, 0.0], [-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """The rendered view that gave the points, and the frame whose pose is wanted.
+
+    view: (h, w, 3) uint8.  depth: (h, w) along the optical axis, 0 where nothing is.  camera (undistorted) and
+    cam_from_object (4, 4) are the view's.  frame: (h', w', 3) uint8.
+    """
+
+    view: np.ndarray
+    depth: np.ndarray
+    camera: Camera
+    cam_from_object: np.ndarray
+    frame: np.ndarray
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Points that were found in the frame: `index` (m,) of them, and their pixels (m, 2) float64."""
+
+    index: np.ndarray
+    pixels: np.ndarray
+
+
+class Aligner:
+    """Finds points (n, 3) of the object, seen in a view, in a frame of the camera."""
+
+    def __init__(self, pictures: Pictures, points: np.ndarray, camera: Camera, config: PnpConfig) -> None:
+        self._view_camera, self._view_pose, self._config = pictures.camera, pictures.cam_from_object, config
+        self._view = cv2.cvtColor(pictures.view, cv2.COLOR_RGB2GRAY)
+        self._frame, self._camera = _shrunk(pictures.frame, camera, max(self._view.shape))
+        self._scale = np.array([self._camera.width / camera.width, self._camera.height / camera.height])
+        in_view = points @ self._view_pose[:3, :3].T + self._view_pose[:3, 3]
+        self._points, self._pixels = points, self._view_camera.project(in_view)
+        self._inverse_depth = np.where(in_view[:, 2] > 0, 1 / np.maximum(in_view[:, 2], 1e-9), np.nan)
+        self._slopes = inverse_depth_slopes(pictures.depth, self._pixels)
+
+    def rounds(self) -> Iterator[tuple[int, float]]:
+        """Level, and largest error that would not surprise, in pixels of the frame, of each round: coarse to fine."""
+        finest = self._config.align_px / float(self._scale.min())
+        for level in range(self._config.align_levels - 1, -1, -1):
+            yield level, _LOOSER * finest * 2**level
+        yield 0, finest
+
+    def place(self, cam_from_object: np.ndarray, level: int) -> Placed:
+        """Look for the points near where a pose puts them; at a level, patches are 2^level pixels coarse."""
+        config, spacing = self._config, float(2**level)
+        around, ahead = self._warped(cam_from_object)
+        size = (self._camera.width - 1, self._camera.height - 1)
+        seen = ahead & ((around[:, 0] >= 0) & (around[:, 0] <= size)).all(axis=1)
+        warp = np.stack([around[:, 2] - around[:, 1], around[:, 4] - around[:, 3]], axis=2)
+        determinant = np.linalg.det(np.where(seen[:, None, None], warp, 0.0))
+        index = np.flatnonzero(seen & (determinant > _FLATTEST) & (determinant < _STEEPEST))
+        places, similarity = np.empty((len(index), 2), np.float32), np.empty(len(index), np.float32)
+        find_patches(
+            _blurred(self._view, level), _blurred(self._frame, level), self._pixels[index].astype(np.float32),
+            np.linalg.inv(warp[index]).astype(np.float32), around[index, 0].astype(np.float32),
+            config.align_half, np.float32(spacing), config.align_steps, places, similarity,
+        )  # fmt: skip
+        found = similarity > config.align_similarity
+        pixels = (places[found].astype(np.float64) + 0.5) / self._scale - 0.5
+        return Placed(index[found], pixels)
+
+    def _warped(self, cam_from_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the points, and pixels of the view half a pixel left, right, above and below, are: (n, 5, 2).
+
+        And which points (n,) are ahead of the camera. The surface around a point is taken to be its tangent plane.
+        """
+        in_view = self._pixels[:, None] + _HALF_PX
+        inverse_depth = self._inverse_depth[:, None] + self._slopes @ _HALF_PX.T
+        camera = self._view_camera
+        ideal = (in_view - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        rays = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=2)
+        frame_from_view = cam_from_object @ inverse(self._view_pose)
+        # A plane's inverse depth is linear in the pixel; points are scaled by it, which projects to the same pixels.
+        scaled = rays @ frame_from_view[:3, :3].T + inverse_depth[..., None] * frame_from_view[:3, 3]
+        ahead = np.isfinite(scaled).all(axis=(1, 2)) & (scaled[..., 2] > 1e-6).all(axis=1)
+        scaled[~ahead] = (0.0, 0.0, 1.0)
+        return self._camera.project(scaled.reshape(-1, 3)).reshape(-1, 5, 2), ahead
+
+
+def inverse_depth_slopes(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Derivatives (n, 2) of the inverse depth by the pixel at pixels (n, 2) of a depth image (h, w), 0 for no surface.
+
+    Of the differences to either side the smaller one counts, which does not reach over an edge.
+    """
+    height, width = depth.shape
+    x, y = np.clip(np.rint(np.nan_to_num(pixels)), 0, (width - 1, height - 1)).astype(int).T
+    here = _inverse(depth[y, x])
+    slopes = []
+    for dx, dy in ((_BASELINE_PX, 0), (0, _BASELINE_PX)):
+        sides = []
+        for sign in (-1, 1):
+            column, row = x + sign * dx, y + sign * dy
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            there = _inverse(depth[np.where(inside, row, y), np.where(inside, column, x)])
+            usable = inside & (here > 0) & (there > 0)
+            sides.append(np.where(usable, sign * (there - here) / _BASELINE_PX, _NO_SURFACE))
+        smaller = np.where(np.abs(sides[0]) <= np.abs(sides[1]), sides[0], sides[1])
+        slopes.append(np.where(np.abs(smaller) < _NO_SURFACE, smaller, 0))
+    return np.stack(slopes, axis=1)
+
+
+def _inverse(depth: np.ndarray) -> np.ndarray:
+    return np.where(depth > 0, 1 / np.maximum(depth, 1e-9), 0)
+
+
+def _shrunk(image: np.ndarray, camera: Camera, longer_side: int) -> tuple[np.ndarray, Camera]:
+    """A frame's grey values and its camera, no larger than the view."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    small = camera.scaled(min(1.0, longer_side / max(camera.width, camera.height)))
+    if small == camera:
+        return grey, camera
+    return cv2.resize(grey, (small.width, small.height), interpolation=cv2.INTER_AREA), small
+
+
+def _blurred(grey: np.ndarray, level: int) -> np.ndarray:
+    values = grey.astype(np.float32) / 255
+    return values if level == 0 else cv2.GaussianBlur(values, (0, 0), _BLUR * 2**level)

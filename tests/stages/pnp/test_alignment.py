@@ -1,0 +1,141 @@
+"""Looking for lifted points in the frame, on a scene whose geometry is known exactly."""
+
+import numpy as np
+import pytest
+from support.analytic_scene import AnalyticScene, camera, viewpoint
+
+from stages.geometry import Camera, exp_se3, perturb, rays, rotation_error_deg, translation_error
+from stages.nerf.rendering_api import RenderedView
+from stages.pnp.alignment import Aligner, Pictures, inverse_depth_slopes
+from stages.pnp.core import PnpConfig, PnpResult, solve
+
+TRUTH = viewpoint(25.0, 38.0)
+LENS = camera(260, (-0.1, 0.02, 0.001, -0.001, 0.0))
+VIEW = camera(200)
+
+
+def photograph(scene: AnalyticScene, lens: Camera, pose: np.ndarray = TRUTH) -> np.ndarray:
+    rgb = scene.render_rays(*rays(lens, pose)).rgb.reshape(lens.height, lens.width, 3)
+    return np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def scene() -> AnalyticScene:
+    return AnalyticScene()
+
+
+@pytest.fixture(scope="module")
+def view(scene: AnalyticScene) -> RenderedView:
+    return scene.render_view(VIEW, perturb(TRUTH, np.random.default_rng(4), (12.0, 12.0), 0.1))
+
+
+@pytest.fixture(scope="module")
+def frame(scene: AnalyticScene) -> np.ndarray:
+    return photograph(scene, LENS)
+
+
+@pytest.fixture(scope="module")
+def points(view: RenderedView) -> np.ndarray:
+    """Points of the surface, away from silhouettes."""
+    rng, opaque = np.random.default_rng(0), view.opacity > 0.99
+    y, x = np.nonzero(opaque & (np.abs(np.gradient(view.depth)).max(axis=0) < 0.05))
+    chosen = rng.choice(len(x), 250, replace=False)
+    origins, directions = rays(view.camera, view.cam_from_object, np.stack([x, y], axis=1)[chosen])
+    return origins + view.depth[y, x][chosen, None] * directions
+
+
+def pictures(view: RenderedView, frame: np.ndarray) -> Pictures:
+    return Pictures(view.rgb, view.depth, view.camera, view.cam_from_object, frame)
+
+
+def in_frame(points: np.ndarray, lens: Camera = LENS) -> np.ndarray:
+    return lens.project(points @ TRUTH[:3, :3].T + TRUTH[:3, 3])
+
+
+def matched(points: np.ndarray, wrong: float, noise_px: float, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    pixels = in_frame(points) + rng.normal(0, noise_px, (len(points), 2))
+    count = int(wrong * len(points))
+    pixels[:count] = rng.uniform(0, 259, (count, 2))
+    return pixels.astype(np.float32)
+
+
+def pose_of(result: PnpResult) -> np.ndarray:
+    assert result.cam_from_object is not None
+    return result.cam_from_object
+
+
+def test_points_are_found_where_they_are(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray
+) -> None:
+    aligner = Aligner(pictures(view, frame), points, LENS, PnpConfig())
+    placed = aligner.place(exp_se3([0.01, -0.005, 0.01, 0.002, -0.003, 0.002]) @ TRUTH, 0)
+    errors = np.linalg.norm(placed.pixels - in_frame(points)[placed.index], axis=1)
+    assert len(placed.index) > 100
+    assert np.median(errors) < 0.25
+
+
+def test_coarse_patches_reach_farther(view: RenderedView, frame: np.ndarray, points: np.ndarray) -> None:
+    """The same patch in an image four times as coarse is looked for four times as far away."""
+    aligner, astray = Aligner(pictures(view, frame), points, LENS, PnpConfig()), exp_se3([0.08, 0, 0, 0, 0, 0]) @ TRUTH
+    near = []
+    for level in (0, 2):
+        placed = aligner.place(astray, level)
+        near.append((np.linalg.norm(placed.pixels - in_frame(points)[placed.index], axis=1) < 2).sum())
+    assert near[1] > 2 * near[0]
+    assert near[1] > 60
+
+
+def test_the_pose_is_better_by_pictures_than_by_matches(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray
+) -> None:
+    pixels = matched(points, 0.6, 1.5)
+    plain = solve(pixels, points, LENS)
+    better = solve(pixels, points, LENS, pictures=pictures(view, frame))
+    assert rotation_error_deg(pose_of(better), TRUTH) < 0.4 * rotation_error_deg(pose_of(plain), TRUTH)
+    assert translation_error(pose_of(better), TRUTH) < 0.4 * translation_error(pose_of(plain), TRUTH)
+    assert better.inliers.sum() > plain.inliers.sum()
+    found = in_frame(points)[better.inliers]
+    assert np.median(np.linalg.norm(better.inliers_in_frame - found, axis=1)) < 0.3
+
+
+def test_a_wrong_pose_is_told_by_how_little_is_found(
+    scene: AnalyticScene, view: RenderedView, points: np.ndarray
+) -> None:
+    """Matches that agree on a pose from which the frame was not taken."""
+    elsewhere = photograph(scene, LENS, viewpoint(200.0, 15.0))
+    pixels = matched(points, 0.0, 1.0)
+    agreed = solve(pixels, points, LENS, PnpConfig(align_levels=0), pictures=pictures(view, elsewhere))
+    assert agreed.inliers.mean() > 0.8
+    placed = Aligner(pictures(view, elsewhere), points, LENS, PnpConfig()).place(pose_of(agreed), 0)
+    assert len(placed.index) < 0.2 * len(points)
+
+
+@pytest.mark.parametrize("frame_shade", [0, 255])
+def test_a_frame_without_anything_leaves_the_pose_of_the_matches(
+    view: RenderedView, points: np.ndarray, frame_shade: int
+) -> None:
+    blank, pixels = np.full((260, 260, 3), frame_shade, np.uint8), matched(points, 0.3, 1.0)
+    plain, looked = solve(pixels, points, LENS), solve(pixels, points, LENS, pictures=pictures(view, blank))
+    assert np.array_equal(pose_of(looked), pose_of(plain))
+    assert np.array_equal(looked.inliers, plain.inliers)
+
+
+def test_points_out_of_sight_are_not_looked_for(view: RenderedView, frame: np.ndarray, points: np.ndarray) -> None:
+    behind = TRUTH.copy()
+    behind[2, 3] = -10.0
+    aligner = Aligner(pictures(view, frame), points, LENS, PnpConfig())
+    assert len(aligner.place(behind, 0).index) == 0
+    assert len(aligner.place(exp_se3([50.0, 0, 0, 0, 0, 0]) @ TRUTH, 2).index) == 0
+
+
+def test_the_slopes_of_a_plane_are_its_own_and_do_not_cross_an_edge() -> None:
+    y, x = np.mgrid[0:40, 0:50].astype(np.float64)
+    depth = 1 / (0.5 + 0.004 * x - 0.002 * y)
+    depth[:, 30:] *= 3
+    depth[:, 45:] = 0
+    pixels = np.array([[10.0, 10.0], [29.0, 20.0], [0.0, 39.0], [44.0, 5.0], [47.0, 5.0]])
+    slopes = inverse_depth_slopes(depth, pixels)
+    np.testing.assert_allclose(slopes[:3], [[0.004, -0.002]] * 3, atol=1e-9)
+    np.testing.assert_allclose(slopes[3], [0.004 / 3, -0.002 / 3], atol=1e-9)
+    assert not slopes[4].any()

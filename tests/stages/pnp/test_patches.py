@@ -1,0 +1,110 @@
+"""The kernel that finds patches, beside a plain twin of it."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stages.pnp.patches import find_patches
+
+
+def texture(rng: np.random.Generator, size: tuple[int, int] = (90, 110), blur: float = 1.5) -> np.ndarray:
+    values = cv2.GaussianBlur(rng.random(size), (0, 0), blur)
+    return ((values - values.min()) / np.ptp(values)).astype(np.float32)
+
+
+def found(first: np.ndarray, second: np.ndarray, centres: np.ndarray, warps: np.ndarray, starts: np.ndarray,
+          half: int = 4, spacing: float = 1.0, steps: int = 8) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    places, similarity = np.empty((len(centres), 2), np.float32), np.empty(len(centres), np.float32)
+    given_as = [np.ascontiguousarray(array, np.float32) for array in (centres, warps, starts)]
+    find_patches(first, second, *given_as, half, np.float32(spacing), steps, places, similarity)
+    return places, similarity
+
+
+def bilinear(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    height, width = image.shape
+    x, y = np.clip(points[..., 0], 0, width - 1), np.clip(points[..., 1], 0, height - 1)
+    column, row = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
+    u, v = x - column, y - row
+    above = (1 - u) * image[row, column] + u * image[row, column + 1]
+    below = (1 - u) * image[row + 1, column] + u * image[row + 1, column + 1]
+    return (1 - v) * above + v * below
+
+
+def plain(first: np.ndarray, second: np.ndarray, centre: np.ndarray, warp: np.ndarray, start: np.ndarray,
+          half: int, spacing: float, steps: int) -> tuple[np.ndarray, float]:  # fmt: skip
+    """One patch, in float64 and by whole arrays."""
+    first, second = first.astype(np.float64), second.astype(np.float64)
+    line = np.arange(-half, half + 1)
+    grid = np.stack(np.meshgrid(line, line), axis=2)
+    weight = np.exp(-(grid**2).sum(axis=2) / (2 * (0.6 * half) ** 2))
+    weight /= weight.sum()
+
+    def centred(values: np.ndarray) -> np.ndarray:
+        return values - (weight * values).sum()
+
+    patch = centred(bilinear(first, centre + spacing * grid @ warp.T))
+    across, down = centred(np.gradient(patch, spacing, axis=1)), centred(np.gradient(patch, spacing, axis=0))
+    slopes = np.stack([across, down], axis=2).reshape(-1, 2)
+    normal = slopes.T @ (weight.reshape(-1, 1) * slopes)
+    if not np.linalg.eigvalsh(normal)[0] * spacing**2 > 1e-5:
+        return start, -1.0
+    contrast, place, alike = np.sqrt((weight * patch**2).sum()), np.array(start, np.float64), -1.0
+    for _ in range(steps):
+        other = centred(bilinear(second, place + spacing * grid))
+        there = max(np.sqrt((weight * other**2).sum()), 1e-3)
+        alike = float((weight * patch * other).sum() / contrast / there)
+        error = weight * (other * contrast / there - patch)
+        shift = np.linalg.solve(normal, slopes.T @ error.ravel())
+        place -= np.clip(shift, -spacing, spacing)
+        if np.linalg.norm(shift) < 0.01 * spacing:
+            break
+    return (place, alike) if np.linalg.norm(place - start) < 3 * spacing else (start, -1.0)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(2, 6), st.sampled_from([1.0, 2.0, 4.0]), st.integers(1, 6))
+def test_the_kernel_does_what_its_plain_twin_does(seed: int, half: int, spacing: float, steps: int) -> None:
+    rng = np.random.default_rng(seed)
+    first, second = texture(rng), texture(rng)
+    second[5:, 3:] = 0.7 * first[:-5, :-3] + 0.3 * second[5:, 3:]
+    centres = rng.uniform(-3, 112, (12, 2)).astype(np.float32)
+    starts = (centres + np.array([3, 5]) + rng.normal(0, spacing, (12, 2))).astype(np.float32)
+    warps = (np.eye(2) + rng.normal(0, 0.1, (12, 2, 2))).astype(np.float32)
+    places, similarity = found(first, second, centres, warps, starts, half, spacing, steps)
+    for i in range(len(centres)):
+        place, alike = plain(first, second, centres[i], warps[i], starts[i], half, spacing, steps)
+        if abs(np.linalg.norm(place - starts[i]) - 3 * spacing) > 0.1:  # on the limit either answer is right
+            assert places[i] == pytest.approx(place, abs=0.02 * spacing)
+            assert similarity[i] == pytest.approx(alike, abs=0.01)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_a_warped_brightened_image_shows_its_patches_where_they_went(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    first = texture(rng, (140, 150), 2.0)
+    warp = np.eye(2) + rng.uniform(-0.15, 0.15, (2, 2))  # from offsets in the second to offsets in the first
+    middle = np.array([75.0, 70.0])
+    second = cv2.warpAffine(
+        first, np.c_[warp, middle - warp @ middle], (150, 140), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    )
+    truth = middle + rng.uniform(-25, 25, (30, 2))
+    centres = middle + (truth - middle) @ warp.T
+    starts = truth + rng.uniform(-0.8, 0.8, truth.shape)
+    places, similarity = found(first, 0.6 * second + 0.2, centres, np.tile(warp, (30, 1, 1)), starts)
+    errors = np.linalg.norm(places - truth, axis=1)
+    assert (similarity > 0.95).mean() > 0.9
+    assert np.median(errors[similarity > 0.95]) < 0.06
+
+
+def test_nothing_is_found_where_nothing_is_to_be_seen() -> None:
+    even, varied = np.full((60, 60), 0.4, np.float32), texture(np.random.default_rng(0), (60, 60))
+    ramp = np.tile(np.linspace(0, 1, 60, dtype=np.float32), (60, 1))
+    places = np.array([[30.0, 30.0]], np.float32)
+    for first, second in ((even, varied), (ramp, ramp)):
+        at, similarity = found(first, second, places, np.eye(2)[None], places)
+        assert similarity[0] == -1
+        assert np.array_equal(at, places)
+    assert found(varied, even, places, np.eye(2)[None], places)[1][0] < 0.1

@@ -39,12 +39,13 @@ class ViewRays:
     """A camera's rays tile by tile, so that rays traced together read the same table entries.
 
     order: (n,) row-major pixel indices; unit: (n, 3) float32 unit directions in the camera; length: (n,) of those with
-    z = 1.
+    z = 1; tile: (n,) index of their tiles, row by row.
     """
 
     order: np.ndarray
     unit: np.ndarray
     length: np.ndarray
+    tile: np.ndarray
 
 
 @lru_cache(maxsize=2)
@@ -53,7 +54,9 @@ def view_rays(camera: Camera) -> ViewRays:
     order = tile_order(camera.width, camera.height)
     directions = camera.directions(camera.grid()[order])
     length = np.linalg.norm(directions, axis=1)
-    return ViewRays(order, directions / length[:, None], length)
+    y, x = np.divmod(order, camera.width)
+    tile = (y // TILE) * -(-camera.width // TILE) + x // TILE
+    return ViewRays(order, directions / length[:, None], length, tile)
 
 
 def tile_view(

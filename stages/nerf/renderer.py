@@ -6,14 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from stages.geometry.cameras import Camera
+from stages.geometry import Camera, camera_centre
 from stages.nerf.field import Field
 from stages.nerf.kernels.jacobian import render_jacobian
 from stages.nerf.kernels.render import render
+from stages.nerf.kernels.sight import block_centres, block_radius, tile_limits
 from stages.nerf.kernels.types import Net
 from stages.nerf.kernels.vectors import WIDTH, reads_half_floats
 from stages.nerf.metadata import FieldMetadata
-from stages.nerf.normalise import by_object_rays, normalised, tile_view
+from stages.nerf.normalise import TILE, by_object_rays, normalised, tile_view, view_rays
 from stages.nerf.rendering_api import RenderedRays, RenderedView
 from stages.nerf.workers import Workers
 
@@ -34,16 +35,17 @@ class NumbaRenderer:
         self.samples_evaluated = 0
         self._net, self._domain = _packed(field.net), field.domain()
         self._background = np.array(field.metadata.background, np.float32)
+        self._centres = None if self._domain.contracted else block_centres(self._domain)
         self._workers = Workers(field.metadata.config, threads, PACKET, PACKET * PER_RAY, backward=False)
         self._jacobian_workers: Workers | None = None
 
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
         """See RayRenderer."""
         o, d, length = normalised(self.metadata.space, origins, directions)
-        traced = self._trace(o, d)
+        traced = self._trace(o, d, _everywhere(len(o)))
         return replace(traced, depth=traced.depth / length)
 
-    def _trace(self, o: np.ndarray, d: np.ndarray) -> RenderedRays:
+    def _trace(self, o: np.ndarray, d: np.ndarray, limits: np.ndarray) -> RenderedRays:
         n = len(o)
         rgb, depth, opacity = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
         jitter = np.full(n, 0.5, np.float32)
@@ -51,7 +53,7 @@ class NumbaRenderer:
             n,
             int(np.clip(n // (4 * self._workers.threads), PACKET, CHUNK)),
             lambda s, a, b: render(
-                self._net, self._domain, o, d, jitter, self._background, a, b,
+                self._net, self._domain, o, d, jitter, limits, self._background, a, b,
                 PER_RAY, self.stop_below, s.samples, s.rays, rgb, depth, opacity,
             ),
         )  # fmt: skip
@@ -84,13 +86,33 @@ class NumbaRenderer:
 
     def render_view(self, camera: Camera, cam_from_object: np.ndarray) -> RenderedView:
         """See RayRenderer."""
-        return tile_view(self._trace, self.metadata.space, camera, cam_from_object)
+        limits = self._limits(camera, cam_from_object)
+        return tile_view(lambda o, d: self._trace(o, d, limits), self.metadata.space, camera, cam_from_object)
+
+    def _limits(self, camera: Camera, cam_from_object: np.ndarray) -> np.ndarray:
+        """Between which distances, in the field's coordinates, a view's rays can meet anything, in their order."""
+        bundle, space = view_rays(camera), self.metadata.space
+        if self._centres is None:
+            return _everywhere(len(bundle.order))
+        rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
+        limits = np.empty((rows, columns, 2), np.float32)
+        origin = (camera_centre(cam_from_object) - space.centre) / space.scale
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        turn = np.ascontiguousarray(cam_from_object[:3, :3])
+        tile_limits(self._centres, block_radius(self._domain), turn, origin, intrinsics, TILE, limits)
+        return limits.reshape(-1, 2)[bundle.tile]
 
     def close(self) -> None:
         """End the threads."""
         self._workers.close()
         if self._jacobian_workers is not None:
             self._jacobian_workers.close()
+
+
+def _everywhere(count: int) -> np.ndarray:
+    limits = np.zeros((count, 2), np.float32)
+    limits[:, 1] = np.inf
+    return limits
 
 
 def _packed(net: Net) -> Net:

@@ -43,5 +43,12 @@ class PnpConfig:
     """patches that correlate less are not found"""
     align_px: float = 1.5
     """largest reprojection error of a point that was found, in pixels of the view"""
+    min_support: float = 0.15
+    """where a smaller share of the points is found in the frame, the matches that agreed may be wrong: others are
+    asked for another pose"""
+    attempts: int = 3
+    """so many poses are looked at, at most"""
+    unconfirmed_share: float = 0.5
+    """of min_inlier_ratio is enough for a pose that is then confirmed by points found in the frame"""
     seed: int = 0
     """of RANSAC's samples"""

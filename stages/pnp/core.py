@@ -6,7 +6,7 @@ Sources: Fischler and Bolles, Random sample consensus (1981); Chum, Matas and Ki
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import poselib
@@ -72,11 +72,14 @@ def solve(
     if count < max(config.min_inliers, _MIN_POINTS):
         return _failed("too_few_consistent_points", count)
     points = points_in_object.astype(np.float64)
-    found = _agreed(pixels_in_frame, points, camera, confidence, config)
+    weights = _weights(confidence, count, config)
+    if pictures is None or config.align_levels == 0:
+        found = _agreed(pixels_in_frame, points, camera, weights, config)
+    else:
+        aligner = Aligner(pictures, points, camera, config)
+        found = _confirmed(pixels_in_frame, points, camera, weights, aligner, config)
     if found is None:
         return _failed("no_consensus", count)
-    if pictures is not None and config.align_levels > 0:
-        found = _aligned(found, Aligner(pictures, points, camera, config), points, camera, config)
     fit, pose = found.fit, found.fit.cam_from_object
     angles = viewing_angles(points[found.index], pose if seen_from is None else seen_from, pose)
     shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles) * count / len(found.index))
@@ -93,22 +96,53 @@ def _failed(reason: str, count: int) -> PnpResult:
     return PnpResult(False, reason, None, np.zeros(count, bool), np.zeros((0, 2), np.float32), None, None)
 
 
+def _weights(confidence: np.ndarray | None, count: int, config: PnpConfig) -> np.ndarray:
+    if confidence is None:
+        return np.ones(count)
+    return np.maximum(confidence.astype(np.float64), _LEAST_CONFIDENCE) ** config.confidence_power
+
+
 def _agreed(
-    pixels_in_frame: np.ndarray, points: np.ndarray, camera: Camera, confidence: np.ndarray | None, config: PnpConfig
+    pixels_in_frame: np.ndarray, points: np.ndarray, camera: Camera, weights: np.ndarray, config: PnpConfig
 ) -> _Consensus | None:
     """The pose that most matches agree on, fitted to these; None where too few do."""
+    if len(points) < _MIN_POINTS:
+        return None
     pixels, plain = _ideal(pixels_in_frame, camera), camera.undistorted()
     threshold = config.threshold_px * max(camera.width, camera.height) / _REFERENCE_SIDE_PX
     start = best_start(pixels, points, plain, threshold, config)
     if start is None:
         return None
-    weights = np.ones(len(pixels))
-    if confidence is not None:
-        weights = np.maximum(confidence.astype(np.float64), _LEAST_CONFIDENCE) ** config.confidence_power
     fit, inliers = _polish(pixels, points, plain, start, weights, threshold, config)
     if fit is None or inliers.sum() < config.min_inlier_ratio * len(pixels):
         return None
     return _Consensus(fit, np.flatnonzero(inliers), pixels_in_frame[inliers])
+
+
+def _confirmed(
+    pixels_in_frame: np.ndarray, points: np.ndarray, camera: Camera, weights: np.ndarray, aligner: Aligner,
+    config: PnpConfig,
+) -> _Consensus | None:
+    """Of the poses that matches agree on, one with enough points found in the frame, else the one with the most.
+
+    Where too few are found, the matches that agreed so far are left out, for others to agree on another pose.
+    """
+    left, best, most = np.arange(len(points)), None, -1
+    fewer = replace(config, min_inlier_ratio=config.min_inlier_ratio * config.unconfirmed_share)
+    for _ in range(config.attempts):
+        agreed = _agreed(pixels_in_frame[left], points[left], camera, weights[left], fewer)
+        if agreed is None:
+            break
+        found = _aligned(agreed, aligner, points, camera, config)
+        confirmed = 0 if found is agreed else len(found.index)
+        if confirmed > most:
+            best, most = replace(found, index=left[found.index]) if found is agreed else found, confirmed
+        if confirmed >= config.min_support * len(points):
+            break
+        left = np.delete(left, agreed.index)
+    if best is None or (most == 0 and len(best.index) < config.min_inlier_ratio * len(points)):
+        return None
+    return best
 
 
 def _aligned(found: _Consensus, aligner: Aligner, points: np.ndarray, camera: Camera, config: PnpConfig) -> _Consensus:

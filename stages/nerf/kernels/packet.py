@@ -153,6 +153,24 @@ def forward(
     With `keep` the rows of all rounds stay, for the backward pass; without, each round reuses them.
     """
     begin(dom, origins, directions, jitter, first, count, rays)
+    return trace(net, dom, origins, directions, first, count, per_ray, stop_below, keep, samples, rays)
+
+
+@njit(nogil=True, fastmath=FASTMATH)
+def trace(
+    net: Net,
+    dom: Domain,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    first: int,
+    count: int,
+    per_ray: int,
+    stop_below: float,
+    keep: bool,
+    samples: Samples,
+    rays: Rays,
+) -> tuple[int, int]:
+    """`forward`, of rays that have begun."""
     row, evaluated = 0, 0
     while True:
         start = row if keep else 0

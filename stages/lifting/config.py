@@ -14,8 +14,12 @@ class LiftingConfig:
     """nearby views from which each point is seen again; 0 turns the test off"""
     angle_deg: float = 3.0
     """how far around the point a nearby view is"""
+    statistic: Literal["median", "mean"] = "median"
+    """mean is the paper's; the median does not blame a thin part, or a point beside an edge, for the few views from
+    which something else is seen in its place"""
     gamma: float = 1.0
-    """points with a larger root mean square displacement are discarded if `enough` remain; in gamma_unit"""
+    """points with a larger displacement, the root of that statistic of its square, are discarded if `enough` remain;
+    in gamma_unit"""
     enough: int = 150
     """where fewer points are so consistent, the most consistent ones are kept up to this number"""
     gamma_most: float = 8.0

@@ -93,7 +93,7 @@ def consistency(
     rng: np.random.Generator,
     config: LiftingConfig,
 ) -> np.ndarray:
-    """The paper's m (n,) float32: mean squared distance between points (n, 3) and where nearby views see them.
+    """The paper's m (n,) float32: mean or median squared distance of points (n, 3) from where nearby views see them.
 
     The views lie on a circle around the camera's centre, at the same distance from the point, evenly spaced.
     """
@@ -104,7 +104,8 @@ def consistency(
     rendered = renderer.render_rays(centres.reshape(-1, 3), directions.reshape(-1, 3))
     # The point is at parameter 1 of its rays; a ray that meets nothing misses it by its whole distance.
     off = (rendered.depth.reshape(directions.shape[:2]) - 1)[..., None] * directions
-    return (off**2).sum(axis=2).mean(axis=0).astype(np.float32)
+    squared = (off**2).sum(axis=2)
+    return (np.median if config.statistic == "median" else np.mean)(squared, axis=0).astype(np.float32)
 
 
 def _nearby_centres(

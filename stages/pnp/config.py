@@ -27,9 +27,9 @@ class PnpConfig:
     """a pose that its inliers leave less certain than this is none"""
     confidence_power: float = 2.0
     """squared errors are weighted by the matches' confidence to this power; 0: all the same"""
-    shared_error: float = 0.7
+    shared_error: float = 0.85
     """how far neighbouring matches err together, as a multiple of the inliers' residuals; found on several scenes"""
-    shared_error_by_angle: float = 0.6
+    shared_error_by_angle: float = 0.35
     """what is added to it for each radian between the directions of view, divided by the share of inliers: features
     move on surfaces that are seen from elsewhere, and a small consensus holds matches that agree by chance"""
     align_levels: int = 3

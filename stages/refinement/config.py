@@ -38,5 +38,5 @@ class RefinementConfig:
     """Adam's, in radians and in shares of the distance to the surface"""
     converged: float = 2e-5
     """a step that is smaller, in the same unit, is the last"""
-    shared_error: float = 0.7
+    shared_error: float = 0.8
     """how far neighbouring pixels err together, as a multiple of their differences in colour"""

@@ -111,6 +111,17 @@ def test_a_wrong_pose_is_told_by_how_little_is_found(
     assert len(placed.index) < 0.2 * len(points)
 
 
+def test_another_pose_is_asked_for_where_matches_agree_on_a_wrong_one(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray
+) -> None:
+    """Most matches agree, as those of a repeated pattern do, on a pose at which the frame shows nothing of them."""
+    pixels, wrong = matched(points, 0.0, 0.5), viewpoint(75.0, 20.0)
+    elsewhere = LENS.project(points @ wrong[:3, :3].T + wrong[:3, 3])
+    pixels[:150] = elsewhere[:150]
+    assert rotation_error_deg(pose_of(solve(pixels, points, LENS)), wrong) < 2
+    assert rotation_error_deg(pose_of(solve(pixels, points, LENS, pictures=pictures(view, frame))), TRUTH) < 0.3
+
+
 @pytest.mark.parametrize("frame_shade", [0, 255])
 def test_a_frame_without_anything_leaves_the_pose_of_the_matches(
     view: RenderedView, points: np.ndarray, frame_shade: int

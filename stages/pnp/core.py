@@ -14,12 +14,13 @@ import poselib
 from stages.geometry import Camera, is_rigid, twist_covariance, viewing_angles
 from stages.pnp.alignment import Aligner, Pictures
 from stages.pnp.config import PnpConfig
-from stages.pnp.least_squares import PoseFit, fit_pose, reprojection
+from stages.pnp.least_squares import CONVERGED, PoseFit, fit_pose, reprojection
 
-__all__ = ["Pictures", "PnpConfig", "PnpResult", "solve"]
+__all__ = ["Pictures", "PnpConfig", "PnpResult", "solve", "warm_up"]
 
 _MIN_POINTS = 4
 _ROUNDS = 3
+_NEAR_ENOUGH = 1e-3
 _LEAST_CONFIDENCE = 0.01
 _REFERENCE_SIDE_PX = 400
 
@@ -62,10 +63,11 @@ def solve(
 ) -> PnpResult:
     """The camera's pose from pixels (n, 2), distorted as the camera has them, and points (n, 3) in the object.
 
-    confidence (n,), relative to each other, counts in the refinement and not in RANSAC. seen_from (4, 4): the pose of
-    the view that gave the points; the further it is from the pose found, the less certain is that. pictures: that view
-    and the frame; with them all points are looked for anew near where RANSAC's pose puts them, whatever they were
-    matched with. The same input gives the same result. Never raises for data that hold no pose: the result says why.
+    confidence (n,), relative to each other, counts in the refinement and not in RANSAC. pictures: the view that gave
+    the points, and the frame; with them all points are looked for anew near where RANSAC's pose puts them, whatever
+    they were matched with. seen_from (4, 4): where the view was, if there are none; the further it is from the pose
+    found, the less certain is that. The same input gives the same result. Never raises for data that hold no pose: the
+    result says why.
     """
     config = config or PnpConfig()
     count, longer_side = len(pixels_in_frame), max(camera.width, camera.height)
@@ -76,6 +78,7 @@ def solve(
     if pictures is None or config.align_levels == 0:
         found = _agreed(pixels_in_frame, points, camera, weights, config)
     else:
+        seen_from = pictures.cam_from_object
         aligner = Aligner(pictures, points, camera, config)
         found = _confirmed(pixels_in_frame, points, camera, weights, aligner, config)
     if found is None:
@@ -90,6 +93,15 @@ def solve(
     inliers[found.index] = True
     rms = float(np.sqrt((fit.residuals_px**2).sum(axis=1).mean()))
     return PnpResult(True, "ok", pose, inliers, in_frame, rms, covariance)
+
+
+def warm_up(config: PnpConfig) -> None:
+    """Solve a made-up problem, so that kernels are compiled (or fetched from the cache) before the first frame."""
+    camera, noise = Camera(64, 64, 64.0, 64.0, 31.5, 31.5), np.random.default_rng(0)
+    pixels = noise.uniform(8, 56, (32, 2)).astype(np.float32)
+    points = camera.directions(pixels) * noise.uniform(2, 3, (32, 1)).astype(np.float32)
+    image, depth = noise.integers(0, 256, (64, 64, 3), np.uint8), np.full((64, 64), 2.5, np.float32)
+    solve(pixels, points, camera, config, pictures=Pictures(image, depth, camera, np.eye(4), image))
 
 
 def _failed(reason: str, count: int) -> PnpResult:
@@ -147,12 +159,15 @@ def _confirmed(
 
 def _aligned(found: _Consensus, aligner: Aligner, points: np.ndarray, camera: Camera, config: PnpConfig) -> _Consensus:
     """The pose by where the points are found in the frame, from round to round; as it was where too few are."""
-    for level, spread_px in aligner.rounds():
+    rounds = list(aligner.rounds())
+    for level, spread_px in rounds:
+        last = (level, spread_px) == rounds[-1]
         placed = aligner.place(found.fit.cam_from_object, level)
         pixels, ones = _ideal(placed.pixels, camera), np.ones(len(placed.index))
         fit, inliers = _polish(
-            pixels, points[placed.index], camera.undistorted(), found.fit.cam_from_object, ones, spread_px, config
-        )
+            pixels, points[placed.index], camera.undistorted(), found.fit.cam_from_object, ones, spread_px, config,
+            CONVERGED if last else _NEAR_ENOUGH,
+        )  # fmt: skip
         if fit is None:
             break
         found = _Consensus(fit, placed.index[inliers], placed.pixels[inliers])
@@ -191,6 +206,7 @@ def _polish(
     weights: np.ndarray,
     threshold: float,
     config: PnpConfig,
+    converged: float = CONVERGED,
 ) -> tuple[PoseFit | None, np.ndarray]:
     """Fit the inliers and choose them anew by the fit, in turn; None where they become too few."""
     pose, fit, inliers = cam_from_object, None, np.zeros(len(pixels), bool)
@@ -202,7 +218,7 @@ def _polish(
         if fit is not None and np.array_equal(agreeing, inliers):
             break
         inliers = agreeing
-        fit = fit_pose(pixels[inliers], points[inliers], camera, pose, weights[inliers])
+        fit = fit_pose(pixels[inliers], points[inliers], camera, pose, weights[inliers], converged)
         pose = fit.cam_from_object
     return fit, inliers
 

@@ -11,7 +11,7 @@ from numba import njit
 from stages.geometry import Camera, exp_se3
 
 _MAX_STEPS = 20
-_CONVERGED = 1e-5
+CONVERGED = 1e-5
 _HUBER = 1.345
 _MEDIAN_TO_SIGMA = 1.1774
 """The median length of a 2-D Gaussian of unit sigma is this; Huber's constant is for a known sigma."""
@@ -37,11 +37,17 @@ class PoseFit:
 
 
 def fit_pose(
-    pixels: np.ndarray, points: np.ndarray, camera: Camera, cam_from_object: np.ndarray, weights: np.ndarray
+    pixels: np.ndarray,
+    points: np.ndarray,
+    camera: Camera,
+    cam_from_object: np.ndarray,
+    weights: np.ndarray,
+    converged: float = CONVERGED,
 ) -> PoseFit:
     """Minimise Huber's loss of the reprojection errors by Levenberg-Marquardt, from a pose near the minimum.
 
-    pixels (n, 2) of an undistorted camera, points (n, 3) in object coordinates, weights (n,) of squared errors.
+    pixels (n, 2) of an undistorted camera, points (n, 3) in object coordinates, weights (n,) of squared errors;
+    converged: the length of a twist that is the last step.
     """
     pose, damping = cam_from_object, 1e-6
     pixels, points, weights = (np.ascontiguousarray(given, np.float64) for given in (pixels, points, weights))
@@ -61,7 +67,7 @@ def fit_pose(
             lengths, moved_lengths = moved_lengths, lengths
         else:
             damping *= 100
-        if np.linalg.norm(step) < _CONVERGED:
+        if np.linalg.norm(step) < converged:
             break
     return PoseFit(pose, *reprojection(pixels, points, camera, pose), weights)
 
@@ -144,7 +150,8 @@ def _lengths(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _huber_width(lengths: np.ndarray) -> float:
-    return max(_HUBER * float(np.median(lengths)) / _MEDIAN_TO_SIGMA, 1e-6)
+    middle = len(lengths) // 2
+    return max(_HUBER * float(np.partition(lengths, middle)[middle]) / _MEDIAN_TO_SIGMA, 1e-6)
 
 
 def _huber_cost(lengths: np.ndarray, delta: float) -> float:

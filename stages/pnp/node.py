@@ -11,7 +11,7 @@ from bus.messages import Correspondences, Estimate, Frame, Header, Message, Reas
 from bus.node import JoinedHandler, Output, reply_header
 from bus.topics import CORRESPONDENCES, ESTIMATE, FRAME, VIEW, Topic
 from stages.pnp.config import PnpConfig
-from stages.pnp.core import Pictures, solve
+from stages.pnp.core import Pictures, solve, warm_up
 from stages.wire import NO_CAMERA, camera_of, frame_image
 
 
@@ -26,24 +26,20 @@ class PnpNode(JoinedHandler):
         super().__init__()
         self._config = config
 
+    def start(self) -> None:
+        warm_up(self._config)
+
     def process(self, joined: dict[Topic, Message]) -> Iterable[Output]:
         given = cast(Correspondences, joined[CORRESPONDENCES])
         kept = np.array(given.kept)
-        pixels = given.pixels_in_frame[kept]
         result = solve(
-            pixels, given.points_in_object[kept], camera_of(given.camera), self._config, given.confidence[kept],
-            np.array(given.guess_cam_from_object), _pictures(joined),
+            given.pixels_in_frame[kept], given.points_in_object[kept], camera_of(given.camera), self._config,
+            given.confidence[kept], np.array(given.guess_cam_from_object), _pictures(joined),
         )  # fmt: skip
         yield ESTIMATE, Estimate(
-            header=reply_header(given.header),
-            ok=result.ok,
-            reason=Reason(result.reason),
-            cam_from_object=result.cam_from_object,
-            covariance=result.covariance,
-            camera=given.camera,
-            inliers_in_frame=result.inliers_in_frame,
-            correspondences=len(pixels),
-            residual_px=result.residual_px,
+            header=reply_header(given.header), ok=result.ok, reason=Reason(result.reason),
+            cam_from_object=result.cam_from_object, covariance=result.covariance, camera=given.camera,
+            inliers_in_frame=result.inliers_in_frame, correspondences=int(kept.sum()), residual_px=result.residual_px,
         )  # fmt: skip
 
     def incomplete(self, joined: dict[Topic, Message], reason: Reason) -> Iterable[Output]:

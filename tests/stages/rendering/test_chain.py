@@ -92,6 +92,17 @@ def test_refinement_switched_off_hands_the_estimate_on_without_the_frame(make_no
     assert not said[POSE].refined  # type: ignore[attr-defined]
 
 
+def test_without_its_pictures_a_pose_is_that_of_the_matches(make_nodes: Any, image: np.ndarray) -> None:
+    """A view that came too late for pnp, or not at all, costs accuracy and no pose."""
+    guess = perturb(POSE_TRUE, np.random.default_rng(0), (10.0, 15.0), 0.1)
+    *before, pnp, _ = make_nodes()
+    said = run_chain([*before, pnp], frame_message(image, LENS), guess_message(guess, LENS))
+    assert pnp.inputs == (CORRESPONDENCES, VIEW, FRAME)
+    blind = list(pnp.handle(CORRESPONDENCES, said[CORRESPONDENCES])) + list(pnp.tick(2**62))
+    errors = [rotation_error_deg(found.cam_from_object, POSE_TRUE) for found in (said[ESTIMATE], blind[0][1])]  # type: ignore[attr-defined]
+    assert errors[0] < 0.5 * errors[1] < 1.0
+
+
 def failed(said: dict[Any, Any]) -> list[Any]:
     return [said[topic].reason for topic in (VIEW, MATCHES, CORRESPONDENCES, ESTIMATE, POSE) if not said[topic].ok]
 

@@ -138,8 +138,8 @@ def test_a_pose_far_from_its_guess_is_tried_as_the_next_guess() -> None:
 
 def test_a_weak_pose_needs_a_second_frame_to_begin_a_track() -> None:
     camera = Camera()
-    assert camera.see(START, inliers=15).state is TrackingState.INITIALIZING
-    belief = camera.see(START, inliers=15)
+    assert camera.see(START, inliers=20).state is TrackingState.INITIALIZING
+    belief = camera.see(START, inliers=20)
     assert belief.state is TrackingState.LIMITED
     assert belief.cam_from_object is START
     assert camera.see(START).state is TrackingState.TRACKING

@@ -86,7 +86,8 @@ class Aligner:
             np.linalg.inv(warp[index]).astype(np.float32), around[index, 0].astype(np.float32),
             config.align_half, np.float32(spacing), config.align_steps, places, similarity,
         )  # fmt: skip
-        found = similarity > config.align_similarity
+        inside = ((places >= 0) & (places <= size)).all(axis=1)
+        found = inside & (similarity > config.align_similarity)
         pixels = (places[found].astype(np.float64) + 0.5) / self._scale - 0.5
         return Placed(index[found], pixels)
 

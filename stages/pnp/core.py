@@ -21,6 +21,8 @@ __all__ = ["Pictures", "PnpConfig", "PnpResult", "solve", "warm_up"]
 _MIN_POINTS = 4
 _ROUNDS = 3
 _NEAR_ENOUGH = 1e-3
+_LEAST_ALIGNED = 0.3
+"""Of the matches that agreed; where fewer points are found, the frame is blurred, say, and the matches know better."""
 _LEAST_CONFIDENCE = 0.01
 _REFERENCE_SIDE_PX = 400
 
@@ -146,9 +148,11 @@ def _confirmed(
         if agreed is None:
             break
         found = _aligned(agreed, aligner, points, camera, config)
-        confirmed = 0 if found is agreed else len(found.index)
+        confirmed = len(found.index)
+        if found is agreed or confirmed < _LEAST_ALIGNED * len(agreed.index):
+            found, confirmed = replace(agreed, index=left[agreed.index]), 0
         if confirmed > most:
-            best, most = replace(found, index=left[found.index]) if found is agreed else found, confirmed
+            best, most = found, confirmed
         if confirmed >= config.min_support * len(points):
             break
         left = np.delete(left, agreed.index)

@@ -1,5 +1,6 @@
 """Looking for lifted points in the frame, on a scene whose geometry is known exactly."""
 
+import cv2
 import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
@@ -130,6 +131,24 @@ def test_a_frame_without_anything_leaves_the_pose_of_the_matches(
     plain, looked = solve(pixels, points, LENS), solve(pixels, points, LENS, pictures=pictures(view, blank))
     assert np.array_equal(pose_of(looked), pose_of(plain))
     assert np.array_equal(looked.inliers, plain.inliers)
+
+
+def test_a_blurred_frame_is_better_known_by_its_matches(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray
+) -> None:
+    """Patches are hardly found in it; the pose must not come to rest on the few that are."""
+    shaken, pixels = cv2.GaussianBlur(frame, (0, 0), 9.0), matched(points, 0.2, 0.7)
+    result = solve(pixels, points, LENS, pictures=pictures(view, shaken))
+    assert result.inliers.sum() > 150
+    assert rotation_error_deg(pose_of(result), TRUTH) < 0.3
+
+
+def test_nothing_is_found_beyond_the_frame(view: RenderedView, frame: np.ndarray, points: np.ndarray) -> None:
+    """A camera turned so that many points are at its image's border."""
+    aligner = Aligner(pictures(view, frame), points, LENS, PnpConfig(align_similarity=-1.0))
+    for angle in (0.2, 0.25, 0.3):
+        placed = aligner.place(exp_se3([0, 0, 0, 0, angle, 0]) @ TRUTH, 2)
+        assert np.all((placed.pixels >= -0.5) & (placed.pixels <= 259.5))
 
 
 def test_points_out_of_sight_are_not_looked_for(view: RenderedView, frame: np.ndarray, points: np.ndarray) -> None:

@@ -105,15 +105,13 @@ class JoinedHandler:
             yield from self._answer(joined)
 
     def _answer(self, joined: Joined) -> Iterator[Output]:
+        reason = Reason.FRAME_MISSING if FRAME in joined.missing else Reason.INTERNAL_ERROR
         if joined.missing:
-            reason = Reason.FRAME_MISSING if FRAME in joined.missing else Reason.INTERNAL_ERROR
             names = ", ".join(topic.name for topic in joined.missing)
             self._throttle.warning("input missing", inputs=names)
-            yield from self.incomplete(joined.inputs, reason)
-            return
         try:
             # All of it before the first is sent, so that a failure half way is one answer and not two.
-            yield from list(self.process(joined.inputs))
+            yield from list(self.incomplete(joined.inputs, reason) if joined.missing else self.process(joined.inputs))
         except Exception as error:
             self.failed += 1
             self._throttle.warning("failed", error=describe(error))

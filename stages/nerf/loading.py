@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stages.geometry import Camera
 from stages.nerf.config import Backend
 from stages.nerf.field import Field, load_field
 from stages.nerf.renderer import NumbaRenderer
@@ -28,9 +29,10 @@ def make_renderer(field: Field, threads: int = 1, backend: Backend = "numba") ->
 
 
 def warm_up(renderer: RayRenderer, jacobian: bool = False) -> None:
-    """Render a few rays, so that kernels are compiled (or fetched from the cache) before the first frame."""
+    """Render a few rays and a view, so that kernels are compiled (or fetched from the cache) before the first frame."""
     origins = np.zeros((8, 3), np.float32)
     directions = np.tile(np.array([[0, 0, 1]], np.float32), (8, 1))
     renderer.render_rays(origins, directions)
+    renderer.render_view(Camera(8, 8, 8.0, 8.0, 3.5, 3.5), np.eye(4))
     if jacobian:
         renderer.render_rays_jacobian(origins, directions, np.eye(3, dtype=np.float32))

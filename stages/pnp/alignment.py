@@ -60,7 +60,7 @@ class Aligner:
         self._frame, self._camera = _shrunk(pictures.frame, camera, max(self._view.shape))
         self._scale = np.array([self._camera.width / camera.width, self._camera.height / camera.height])
         in_view = points @ self._view_pose[:3, :3].T + self._view_pose[:3, 3]
-        self._points, self._pixels = points, self._view_camera.project(in_view)
+        self._pixels = self._view_camera.project(in_view)
         self._inverse_depth = np.where(in_view[:, 2] > 0, 1 / np.maximum(in_view[:, 2], 1e-9), np.nan)
         self._slopes = inverse_depth_slopes(pictures.depth, self._pixels)
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from stages.errors import ConfigError
+
 
 @dataclass(frozen=True)
 class PnpConfig:
@@ -25,6 +27,8 @@ class PnpConfig:
     """inliers must extend at least this share of the image's longer side across their narrowest direction (std)"""
     max_rotation_std_deg: float = 5.0
     """a pose that its inliers leave less certain than this is none"""
+    max_translation_std: float = 0.01
+    """nor is one whose translation is less certain than this share of the distance to the inliers"""
     confidence_power: float = 2.0
     """squared errors are weighted by the matches' confidence to this power; 0: all the same"""
     shared_error: float = 0.85
@@ -33,8 +37,8 @@ class PnpConfig:
     """what is added to it for each radian between the directions of view, divided by the share of inliers: features
     move on surfaces that are seen from elsewhere, and a small consensus holds matches that agree by chance"""
     align_levels: int = 3
-    """points are then looked for in the frame by the patches around them, from patches coarsened so often, each time
-    by 2, down to fine ones; 0: matched pixels are taken as they are"""
+    """points are then looked for in the frame by the patches around them, at so many levels of coarseness, each twice
+    as fine as the one before; 0: matched pixels are taken as they are"""
     align_half: int = 4
     """a patch has this many samples to either side of its middle"""
     align_steps: int = 8
@@ -52,3 +56,9 @@ class PnpConfig:
     """of min_inlier_ratio is enough for a pose that is then confirmed by points found in the frame"""
     seed: int = 0
     """of RANSAC's samples"""
+
+    def __post_init__(self) -> None:
+        least = {"align_levels": 0, "align_half": 1, "align_steps": 1, "attempts": 1, "iterations": 1, "min_inliers": 1}
+        for name, value in least.items():
+            if getattr(self, name) < value:
+                raise ConfigError(f"pnp: {name} is {getattr(self, name)}, but must be at least {value}")

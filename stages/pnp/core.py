@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import poselib
 
-from stages.geometry import Camera, is_rigid, twist_covariance, viewing_angles
+from stages.errors import StageError
+from stages.geometry import Camera, camera_centre, is_rigid, twist_covariance, viewing_angles
 from stages.pnp.alignment import Aligner, Pictures
 from stages.pnp.config import PnpConfig
 from stages.pnp.least_squares import CONVERGED, PoseFit, fit_pose, reprojection
@@ -89,7 +90,8 @@ def solve(
     angles = viewing_angles(points[found.index], pose if seen_from is None else seen_from, pose)
     shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles) * count / len(found.index))
     covariance = twist_covariance(fit.jacobian, fit.weights, found.pixels, longer_side, fit.variance, shared)
-    if not _plausible(covariance, found.pixels, longer_side, config):
+    distance = float(np.median(np.linalg.norm(points[found.index] - camera_centre(pose), axis=1)))
+    if not _plausible(covariance, found.pixels, longer_side, distance, config):
         return _failed("implausible_pose", count)
     inliers, in_frame = np.zeros(count, bool), found.pixels.astype(np.float32)
     inliers[found.index] = True
@@ -137,43 +139,45 @@ def _confirmed(
     pixels_in_frame: np.ndarray, points: np.ndarray, camera: Camera, weights: np.ndarray, aligner: Aligner,
     config: PnpConfig,
 ) -> _Consensus | None:
-    """Of the poses that matches agree on, one with enough points found in the frame, else the one with the most.
+    """Of the poses that matches agree on, the first that enough points found in the frame bear out.
 
-    Where too few are found, the matches that agreed so far are left out, for others to agree on another pose.
+    Where too few do, the matches that agreed so far are left out, for others to agree on another pose. If that
+    leads nowhere either, it is the first after all.
     """
-    left, best, most = np.arange(len(points)), None, -1
+    left, first, most = np.arange(len(points)), None, 0
+    enough, least = (share * len(points) for share in (config.min_support, config.min_inlier_ratio))
     fewer = replace(config, min_inlier_ratio=config.min_inlier_ratio * config.unconfirmed_share)
     for _ in range(config.attempts):
         agreed = _agreed(pixels_in_frame[left], points[left], camera, weights[left], fewer)
         if agreed is None:
             break
-        found = _aligned(agreed, aligner, points, camera, config)
-        confirmed = len(found.index)
-        if found is agreed or confirmed < _LEAST_ALIGNED * len(agreed.index):
-            found, confirmed = replace(agreed, index=left[agreed.index]), 0
-        if confirmed > most:
-            best, most = found, confirmed
-        if confirmed >= config.min_support * len(points):
-            break
-        left = np.delete(left, agreed.index)
-    if best is None or (most == 0 and len(best.index) < config.min_inlier_ratio * len(points)):
-        return None
-    return best
+        agreed, others = replace(agreed, index=left[agreed.index]), np.delete(left, agreed.index)
+        found, most = _aligned(agreed, aligner, points, camera, config), max(most, len(agreed.index))
+        if found is not None and len(found.index) < _LEAST_ALIGNED * most:
+            found = None
+        if found is not None and len(found.index) >= enough:
+            return found
+        first, left = first or found or agreed, others
+    return first if first is not None and len(first.index) >= least else None
 
 
-def _aligned(found: _Consensus, aligner: Aligner, points: np.ndarray, camera: Camera, config: PnpConfig) -> _Consensus:
-    """The pose by where the points are found in the frame, from round to round; as it was where too few are."""
-    rounds = list(aligner.rounds())
-    for level, spread_px in rounds:
-        last = (level, spread_px) == rounds[-1]
+def _aligned(
+    agreed: _Consensus, aligner: Aligner, points: np.ndarray, camera: Camera, config: PnpConfig
+) -> _Consensus | None:
+    """The pose by where the points are found in the frame, from round to round; None where too few are."""
+    found, rounds = agreed, list(aligner.rounds())
+    for i, (level, spread_px) in enumerate(rounds):
         placed = aligner.place(found.fit.cam_from_object, level)
-        pixels, ones = _ideal(placed.pixels, camera), np.ones(len(placed.index))
+        try:
+            pixels, ones = _ideal(placed.pixels, camera), np.ones(len(placed.index))
+        except StageError:  # a point was found where the lens has no inverse
+            return None
         fit, inliers = _polish(
             pixels, points[placed.index], camera.undistorted(), found.fit.cam_from_object, ones, spread_px, config,
-            CONVERGED if last else _NEAR_ENOUGH,
+            CONVERGED if i == len(rounds) - 1 else _NEAR_ENOUGH,
         )  # fmt: skip
         if fit is None:
-            break
+            return None
         found = _Consensus(fit, placed.index[inliers], placed.pixels[inliers])
     return found
 
@@ -196,7 +200,9 @@ def best_start(
         "max_reproj_error": threshold, "max_iterations": config.iterations,
         "min_iterations": config.least_iterations, "success_prob": config.confidence, "seed": config.seed,
     }  # fmt: skip
-    found, about = poselib.estimate_absolute_pose(pixels, points, {**model, "params": intrinsics}, options, {})
+    found, about = poselib.estimate_absolute_pose(
+        pixels, points, {**model, "params": intrinsics}, ransac_opt=options, bundle_opt={}
+    )
     pose = np.eye(4)
     pose[:3] = found.Rt
     return pose if about["num_inliers"] >= _MIN_POINTS and is_rigid(pose) else None
@@ -227,9 +233,12 @@ def _polish(
     return fit, inliers
 
 
-def _plausible(covariance: np.ndarray, inlier_pixels: np.ndarray, longer_side: int, config: PnpConfig) -> bool:
-    """Whether the inliers extend over the image and leave the pose certain."""
+def _plausible(
+    covariance: np.ndarray, inlier_pixels: np.ndarray, longer_side: int, distance: float, config: PnpConfig
+) -> bool:
+    """Whether the inliers, so far from the camera, extend over the image and leave the pose certain."""
     spread = np.sqrt(max(np.linalg.eigvalsh(np.cov(inlier_pixels.T))[0], 0.0))
-    uncertainty = np.sqrt(max(np.linalg.eigvalsh(covariance[3:, 3:])[-1], 0.0))
-    certain = np.isfinite(uncertainty) and np.rad2deg(uncertainty) <= config.max_rotation_std_deg
+    shift = np.sqrt(max(np.trace(covariance[:3, :3]), 0.0))
+    turn = np.sqrt(max(np.linalg.eigvalsh(covariance[3:, 3:])[-1], 0.0))
+    certain = np.rad2deg(turn) <= config.max_rotation_std_deg and shift <= config.max_translation_std * distance
     return bool(certain and spread >= config.min_spread * longer_side)

@@ -47,13 +47,15 @@ def fit_pose(
     """Minimise Huber's loss of the reprojection errors by Levenberg-Marquardt, from a pose near the minimum.
 
     pixels (n, 2) of an undistorted camera, points (n, 3) in object coordinates, weights (n,) of squared errors;
-    converged: the length of a twist that is the last step.
+    converged: the length of a twist, in radians and shares of the points' distance, that is the last step.
     """
     pose, damping = cam_from_object, 1e-6
     pixels, points, weights = (np.ascontiguousarray(given, np.float64) for given in (pixels, points, weights))
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     lengths, moved_lengths = np.empty(len(points)), np.empty(len(points))
     gradient, hessian = np.empty(6), np.empty((6, 6))
+    distance = np.linalg.norm(np.median(points, axis=0) @ pose[:3, :3].T + pose[:3, 3])
+    unit = np.array([max(distance, 1e-12)] * 3 + [1.0] * 3)
     weighted_lengths(pixels, points, intrinsics, pose, weights, lengths)
     for _ in range(_MAX_STEPS):
         delta = _huber_width(lengths)
@@ -67,7 +69,7 @@ def fit_pose(
             lengths, moved_lengths = moved_lengths, lengths
         else:
             damping *= 100
-        if np.linalg.norm(step) < converged:
+        if np.linalg.norm(step / unit) < converged:
             break
     return PoseFit(pose, *reprojection(pixels, points, camera, pose), weights)
 

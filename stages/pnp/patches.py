@@ -109,6 +109,9 @@ def find_patches(
     patch, other = np.empty(count, np.float32), np.empty(count, np.float32)
     warped_x, warped_y = np.empty(count, np.float32), np.empty(count, np.float32)
     across, down = np.empty(count, np.float32), np.empty(count, np.float32)
+    if min(first.shape[0], first.shape[1], second.shape[0], second.shape[1]) < 2:
+        places[:], similarity[:] = starts, -1
+        return
     flat, flat_there = first.reshape(-1), second.reshape(-1)
     for i in range(centres.shape[0]):
         places[i] = starts[i]

@@ -33,7 +33,8 @@ def some_camera(rng: np.random.Generator) -> tuple[Camera, np.ndarray]:
     """Far away, near, or within the box; looking at it or past it; sizes that are no multiple of a tile."""
     width, height = rng.integers(9, 70, 2)
     focal = rng.uniform(0.4, 2.0) * width
-    camera = Camera(int(width), int(height), focal, 1.1 * focal, rng.uniform(0, width), rng.uniform(0, height))
+    cx, cy = rng.uniform(-0.5, 1.5, 2) * (width, height)
+    camera = Camera(int(width), int(height), focal, 1.1 * focal, cx, cy)
     eye = rng.normal(size=3) * rng.choice([0.3, 1.5, 5.0])
     pose = look_at(eye, rng.normal(size=3) * rng.choice([0.1, 1.5]), (0.0, 0.0, 1.0))
     return camera, exp_se3([0, 0, 0, 0, 0, rng.uniform(-3, 3)]) @ pose
@@ -49,8 +50,9 @@ def test_a_view_is_what_its_rays_are_one_by_one(seed: int, fill: float) -> None:
         (view.opacity, traced.opacity, 2e-3), (view.depth, traced.depth, 5e-3),
         (view.rgb / 255.0, traced.rgb.reshape(*view.depth.shape, 3), 6e-3),
     ):  # fmt: skip
-        different = np.abs(whole - single.reshape(whole.shape)) > tolerance
-        assert different.mean() < 0.01  # a sample on the border of two cells may fall into either
+        different = (np.abs(whole - single.reshape(whole.shape)) > tolerance).reshape(view.depth.size, -1).any(axis=1)
+        visible = max(int((traced.opacity > 0).sum()), 1)
+        assert different.sum() <= 1 + 0.06 * visible  # a sample on the border of two cells may fall into either
 
 
 @settings(max_examples=60, deadline=None)

@@ -109,8 +109,27 @@ def test_a_wrong_pose_is_told_by_how_little_is_found(
     agreed = solve(pixels, points, LENS, PnpConfig(align_levels=0), pictures=pictures(view, elsewhere))
     assert agreed.inliers.mean() > 0.8
     placed = Aligner(pictures(view, elsewhere), points, LENS, PnpConfig()).place(pose_of(agreed), 0)
-    assert len(placed.index) < 0.2 * len(points)
+    assert len(placed.index) < PnpConfig().min_support * len(points)
 
+
+def test_few_matches_give_a_pose_only_if_points_are_found_where_it_puts_them(
+    scene: AnalyticScene, view: RenderedView, frame: np.ndarray, points: np.ndarray
+) -> None:
+    """One in seventeen matches is right, which is too few to believe without seeing."""
+    pixels, config = matched(points, 0.94, 0.4, seed=3), PnpConfig(least_iterations=50_000, iterations=50_000)
+    assert not solve(pixels, points, LENS, config).ok
+    seen = solve(pixels, points, LENS, config, pictures=pictures(view, frame))
+    assert rotation_error_deg(pose_of(seen), TRUTH) < 0.3
+    elsewhere = photograph(scene, LENS, viewpoint(200.0, 15.0))
+    assert not solve(pixels, points, LENS, config, pictures=pictures(view, elsewhere)).ok
+
+
+@pytest.mark.parametrize("size", [(1, 200), (200, 1), (1, 1)])
+def test_a_picture_one_pixel_wide_shows_nothing(points: np.ndarray, size: tuple[int, int]) -> None:
+    thin = Camera(*size, 270.0, 270.0, (size[0] - 1) / 2, (size[1] - 1) / 2)
+    blank = np.zeros((size[1], size[0], 3), np.uint8)
+    given = Pictures(blank, np.ones(blank.shape[:2], np.float32), thin, TRUTH, blank)
+    assert len(Aligner(given, points, thin, PnpConfig()).place(TRUTH, 0).index) == 0
 
 def test_another_pose_is_asked_for_where_matches_agree_on_a_wrong_one(
     view: RenderedView, frame: np.ndarray, points: np.ndarray
@@ -138,9 +157,10 @@ def test_a_blurred_frame_is_better_known_by_its_matches(
 ) -> None:
     """Patches are hardly found in it; the pose must not come to rest on the few that are."""
     shaken, pixels = cv2.GaussianBlur(frame, (0, 0), 9.0), matched(points, 0.2, 0.7)
+    pixels[200:] += np.array([3.5, 2.5], np.float32)  # near misses agree among themselves too
     result = solve(pixels, points, LENS, pictures=pictures(view, shaken))
-    assert result.inliers.sum() > 150
-    assert rotation_error_deg(pose_of(result), TRUTH) < 0.3
+    assert result.inliers.sum() > 120
+    assert rotation_error_deg(pose_of(result), TRUTH) < 0.5
 
 
 def test_nothing_is_found_beyond_the_frame(view: RenderedView, frame: np.ndarray, points: np.ndarray) -> None:
@@ -148,6 +168,7 @@ def test_nothing_is_found_beyond_the_frame(view: RenderedView, frame: np.ndarray
     aligner = Aligner(pictures(view, frame), points, LENS, PnpConfig(align_similarity=-1.0))
     for angle in (0.2, 0.25, 0.3):
         placed = aligner.place(exp_se3([0, 0, 0, 0, angle, 0]) @ TRUTH, 2)
+        assert len(placed.index) > 10
         assert np.all((placed.pixels >= -0.5) & (placed.pixels <= 259.5))
 
 

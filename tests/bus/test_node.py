@@ -146,6 +146,18 @@ class TestJoined:
         assert (failed.ok, failed.reason, failed.header.frame_id) == (False, Reason.FRAME_MISSING, 5)
         assert 0.08 < time.monotonic() - started < 2.0
 
+    def test_an_exception_over_incomplete_inputs_is_a_failed_answer_too(self) -> None:
+        class Lenient(Matching):
+            def incomplete(self, joined: dict[Topic, Message], reason: Reason) -> Iterable[Output]:
+                return self.process(joined)
+
+        handler = Lenient()
+        assert not list(handler.handle(VIEW, view(5)))
+        ((topic, failed),) = handler.tick(2**62)
+        assert topic is MATCHES
+        assert isinstance(failed, Matches)
+        assert (failed.ok, failed.reason, handler.failed) == (False, Reason.INTERNAL_ERROR, 1)
+
     def test_frames_are_kept_though_the_topic_is_newest_only(self, ends: tuple[Outbox, Inbox]) -> None:
         outbox, inbox = ends
         for frame_id in range(100, 164):

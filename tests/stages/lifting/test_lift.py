@@ -98,6 +98,22 @@ def test_mining_discards_points_off_the_surface_and_keeps_those_on_it() -> None:
     assert np.median(lifted.consistency[wrong]) > 100 * np.median(lifted.consistency[right])
 
 
+def test_a_point_that_few_views_see_otherwise_is_only_blamed_by_the_mean() -> None:
+    """A wall at z = 3, and something in front of it that one nearby view of six has in its way."""
+
+    class Wall:
+        def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
+            depth = (3.0 - origins[:, 2]) / directions[:, 2]
+            depth[:4] *= 0.5
+            return RenderedRays(np.zeros((len(depth), 3), np.float32), depth, np.ones_like(depth))
+
+    points = np.array([[0.0, 0.0, 3.0], [0.2, 0.1, 3.0], [-0.3, 0.2, 3.0], [0.1, -0.2, 3.0]])
+    for statistic, blamed in (("median", False), ("mean", True)):
+        config = LiftingConfig(views=6, statistic=statistic)  # type: ignore[arg-type]
+        spread = consistency(Wall(), points, np.zeros(3), np.random.default_rng(0), config)  # type: ignore[arg-type]
+        assert ((spread > 0.1) == blamed).all()
+
+
 def test_a_smaller_gamma_keeps_fewer_and_a_unit_is_absolute(scene: AnalyticScene, view: RenderedView) -> None:
     pixels = CAMERA.grid()[view.opacity.ravel() > 0.5][::7]
 

@@ -1,13 +1,16 @@
 """Looking for lifted points in the frame, on a scene whose geometry is known exactly."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
+from stages.errors import StageError
 from stages.geometry import Camera, exp_se3, perturb, rays, rotation_error_deg, translation_error
 from stages.nerf.rendering_api import RenderedView
-from stages.pnp.alignment import Aligner, Pictures, inverse_depth_slopes
+from stages.pnp.alignment import Aligner, Pictures, Placed, inverse_depth_slopes
 from stages.pnp.core import PnpConfig, PnpResult, solve
 
 TRUTH = viewpoint(25.0, 38.0)
@@ -170,6 +173,22 @@ def test_nothing_is_found_beyond_the_frame(view: RenderedView, frame: np.ndarray
         placed = aligner.place(exp_se3([0, 0, 0, 0, angle, 0]) @ TRUTH, 2)
         assert len(placed.index) > 10
         assert np.all((placed.pixels >= -0.5) & (placed.pixels <= 259.5))
+
+
+def test_points_found_where_the_lens_has_no_inverse_leave_the_pose_of_the_matches(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """k1 = -1.2 folds the image over itself 123 pixels from its middle."""
+    folding = replace(LENS, distortion=(-1.2, 0.0, 0.0, 0.0, 0.0))
+    inner = np.linalg.norm(in_frame(points) - 129.5, axis=1) < 60
+    pixels = in_frame(points[inner], folding).astype(np.float32)
+    corner = Placed(np.arange(20), np.tile([[5.0, 5.0]], (20, 1)))
+    monkeypatch.setattr(Aligner, "place", lambda self, pose, level: corner)
+    with pytest.raises(StageError):
+        folding.directions(corner.pixels)
+    plain = solve(pixels, points[inner], folding)
+    looked = solve(pixels, points[inner], folding, pictures=pictures(view, frame))
+    assert np.array_equal(pose_of(looked), pose_of(plain))
 
 
 def test_points_out_of_sight_are_not_looked_for(view: RenderedView, frame: np.ndarray, points: np.ndarray) -> None:

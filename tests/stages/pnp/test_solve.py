@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from bus.messages import Reason
+from stages.errors import ConfigError
 from stages.geometry import Camera, exp_se3, inverse, log_se3, look_at, rotation_error_deg, translation_error
 from stages.pnp.core import PnpConfig, PnpResult, solve
 from stages.pnp.least_squares import normal_equations, reprojection, weighted_lengths
@@ -94,6 +95,23 @@ def test_a_pose_seen_from_afar_is_less_certain() -> None:
     assert far.covariance is not None
     assert np.linalg.eigvalsh(far.covariance - near.covariance).min() > -1e-15
     assert np.trace(far.covariance) > 1.25 * np.trace(near.covariance)
+
+
+def test_a_pose_is_none_that_its_inliers_leave_uncertain() -> None:
+    pixels, points, _ = problem(np.random.default_rng(3), 60, 0.0, 1.0)
+    covariance = solve(pixels, points, CAMERA).covariance
+    assert covariance is not None
+    distance = float(np.median(np.linalg.norm(points - inverse(POSE)[:3, 3], axis=1)))
+    share = np.sqrt(np.trace(covariance[:3, :3])) / distance
+    assert solve(pixels, points, CAMERA, PnpConfig(max_translation_std=1.02 * share)).ok
+    refused = solve(pixels, points, CAMERA, PnpConfig(max_translation_std=0.98 * share))
+    assert (refused.ok, refused.reason) == (False, "implausible_pose")
+
+
+@pytest.mark.parametrize("setting", [{"align_half": 0}, {"align_levels": -1}, {"attempts": 0}])
+def test_settings_that_mean_nothing_are_refused(setting: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match=r"pnp: \w+ is -?\d, but must be at least \d"):
+        PnpConfig(**setting)  # type: ignore[arg-type]
 
 
 def test_confidence_tells_precise_matches_from_coarse_ones() -> None:

@@ -27,7 +27,7 @@ class PnpConfig:
     """inliers must extend at least this share of the image's longer side across their narrowest direction (std)"""
     max_rotation_std_deg: float = 5.0
     """a pose that its inliers leave less certain than this is none"""
-    max_translation_std: float = 0.01
+    max_translation_std: float = 0.025
     """nor is one whose translation is less certain than this share of the distance to the inliers"""
     confidence_power: float = 2.0
     """squared errors are weighted by the matches' confidence to this power; 0: all the same"""

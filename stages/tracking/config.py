@@ -31,7 +31,7 @@ class ScoreConfig:
     min_inliers: int = 8
     """Fewer score 0."""
     good_inliers: int = 40
-    good_inlier_ratio: float = 0.75
+    good_inlier_ratio: float = 0.55
     """Of the points lifted, those that were found in the frame where the pose puts them."""
     good_residual_px: float = 2.0
     """Median reprojection error of the inliers."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -29,7 +30,8 @@ def test_what_is_not_covered_stays_as_it_was(seed: int, share: float) -> None:
     changed = (image != GREY).any(axis=2)
     assert hidden.any()
     assert changed[hidden].mean() > 0.9
-    assert (changed & ~hidden).mean() < 0.05  # the half-transparent rim
+    near = cv2.dilate(hidden.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    assert not (changed & ~near).any()  # beside what is hidden there is only the half-transparent rim
 
 
 def test_at_least_the_wanted_share_is_covered() -> None:

@@ -74,6 +74,17 @@ def fit_pose(
     return PoseFit(pose, *reprojection(pixels, points, camera, pose), weights)
 
 
+@njit(inline="always")
+def ideal(pose: np.ndarray, point: np.ndarray) -> tuple[float, float, float]:
+    """Where a point is in an image of focal length 1, and its depth; where that is not positive, it alone counts."""
+    p0, p1, p2 = point
+    z = pose[2, 0] * p0 + pose[2, 1] * p1 + pose[2, 2] * p2 + pose[2, 3]
+    inverse = 1 / z if z > 0 else 0.0
+    u = (pose[0, 0] * p0 + pose[0, 1] * p1 + pose[0, 2] * p2 + pose[0, 3]) * inverse
+    v = (pose[1, 0] * p0 + pose[1, 1] * p1 + pose[1, 2] * p2 + pose[1, 3]) * inverse
+    return u, v, z
+
+
 @njit(nogil=True, cache=True)
 def weighted_lengths(
     pixels: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray, weights: np.ndarray,
@@ -82,13 +93,10 @@ def weighted_lengths(
     """Reprojection errors out (n,), each times the root of its weight; infinite behind the camera. All float64."""
     fx, fy, cx, cy = intrinsics
     for i in range(points.shape[0]):
-        p0, p1, p2 = points[i]
-        z = pose[2, 0] * p0 + pose[2, 1] * p1 + pose[2, 2] * p2 + pose[2, 3]
+        u, v, z = ideal(pose, points[i])
         if z <= 0:
             out[i] = np.inf
             continue
-        u = (pose[0, 0] * p0 + pose[0, 1] * p1 + pose[0, 2] * p2 + pose[0, 3]) / z
-        v = (pose[1, 0] * p0 + pose[1, 1] * p1 + pose[1, 2] * p2 + pose[1, 3]) / z
         x, y = fx * u + cx - pixels[i, 0], fy * v + cy - pixels[i, 1]
         out[i] = math.sqrt(weights[i] * (x * x + y * y))
 
@@ -107,12 +115,9 @@ def normal_equations(
     hessian[:] = 0
     rows = np.empty((2, 6))
     for i in range(points.shape[0]):
-        p0, p1, p2 = points[i]
-        z = pose[2, 0] * p0 + pose[2, 1] * p1 + pose[2, 2] * p2 + pose[2, 3]
+        u, v, z = ideal(pose, points[i])
         if z <= 0:
             continue
-        u = (pose[0, 0] * p0 + pose[0, 1] * p1 + pose[0, 2] * p2 + pose[0, 3]) / z
-        v = (pose[1, 0] * p0 + pose[1, 1] * p1 + pose[1, 2] * p2 + pose[1, 3]) / z
         x, y = fx * u + cx - pixels[i, 0], fy * v + cy - pixels[i, 1]
         length = math.sqrt(weights[i] * (x * x + y * y))
         weight = weights[i] * (1.0 if length <= delta else delta / length)

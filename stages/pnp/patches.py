@@ -74,6 +74,23 @@ def _slopes(patch: np.ndarray, side: int, spacing: float, across: np.ndarray, do
             down[j * side + i] = (patch[under * side + i] - patch[above * side + i]) / (spacing * (under - above))
 
 
+@njit(nogil=True)
+def _window(half: int, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Offsets across and down of a patch's samples, row by row, and their weights, which add up to 1."""
+    side = 2 * half + 1
+    count = side * side
+    x_offset, y_offset = np.empty(count, np.float32), np.empty(count, np.float32)
+    weight, total = np.empty(count, np.float32), np.float32(0)
+    for k in range(count):
+        dx, dy = k % side - half, k // side - half
+        x_offset[k], y_offset[k] = spacing * dx, spacing * dy
+        weight[k] = math.exp(-(dx * dx + dy * dy) / (2 * (0.6 * half) ** 2))
+        total += weight[k]
+    for k in range(count):
+        weight[k] /= total
+    return x_offset, y_offset, weight
+
+
 @njit(nogil=True, cache=True)
 def find_patches(
     first: np.ndarray,
@@ -95,23 +112,15 @@ def find_patches(
     towards the middle, -1 to 1; -1 where the patch is too plain to be placed or the search leads away by three
     spacings or more (the place is then the start). All float32.
     """
-    side = 2 * half + 1
-    count = side * side
-    x_offset, y_offset = np.empty(count, np.float32), np.empty(count, np.float32)
-    weight, total = np.empty(count, np.float32), np.float32(0)
-    for k in range(count):
-        dx, dy = k % side - half, k // side - half
-        x_offset[k], y_offset[k] = spacing * dx, spacing * dy
-        weight[k] = math.exp(-(dx * dx + dy * dy) / (2 * (0.6 * half) ** 2))
-        total += weight[k]
-    for k in range(count):
-        weight[k] /= total
-    patch, other = np.empty(count, np.float32), np.empty(count, np.float32)
-    warped_x, warped_y = np.empty(count, np.float32), np.empty(count, np.float32)
-    across, down = np.empty(count, np.float32), np.empty(count, np.float32)
     if min(first.shape[0], first.shape[1], second.shape[0], second.shape[1]) < 2:
         places[:], similarity[:] = starts, -1
         return
+    side = 2 * half + 1
+    count = side * side
+    x_offset, y_offset, weight = _window(half, spacing)
+    patch, other = np.empty(count, np.float32), np.empty(count, np.float32)
+    warped_x, warped_y = np.empty(count, np.float32), np.empty(count, np.float32)
+    across, down = np.empty(count, np.float32), np.empty(count, np.float32)
     flat, flat_there = first.reshape(-1), second.reshape(-1)
     for i in range(centres.shape[0]):
         places[i] = starts[i]

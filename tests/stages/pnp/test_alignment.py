@@ -134,6 +134,7 @@ def test_a_picture_one_pixel_wide_shows_nothing(points: np.ndarray, size: tuple[
     given = Pictures(blank, np.ones(blank.shape[:2], np.float32), thin, TRUTH, blank)
     assert len(Aligner(given, points, thin, PnpConfig()).place(TRUTH, 0).index) == 0
 
+
 def test_another_pose_is_asked_for_where_matches_agree_on_a_wrong_one(
     view: RenderedView, frame: np.ndarray, points: np.ndarray
 ) -> None:

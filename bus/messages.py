@@ -21,6 +21,7 @@ class Reason(StrEnum):
     OK = "ok"
     FRAME_MISSING = "frame_missing"
     FRAME_UNREADABLE = "frame_unreadable"
+    NOTHING_ALIKE = "nothing_alike"
     NOTHING_IN_VIEW = "nothing_in_view"
     TOO_FEW_MATCHES = "too_few_matches"
     TOO_FEW_CONSISTENT_POINTS = "too_few_consistent_points"
@@ -148,6 +149,20 @@ class Guess(Message, kw_only=True):
     cam_from_object: np.ndarray
     camera: CameraModel
     _arrays: ClassVar = {"cam_from_object": POSE}
+
+
+class Retrieved(Message, kw_only=True):
+    """Training views that look like a frame, the most alike first; similarity in 0..1."""
+
+    ok: bool
+    reason: Reason
+    cam_from_object: np.ndarray
+    similarity: np.ndarray
+    _arrays: ClassVar = {"cam_from_object": ("float64", (None, 4, 4)), "similarity": ("float32", (None,))}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_equal("length", {name: len(getattr(self, name)) for name in self._arrays})
 
 
 class View(Message, kw_only=True):

@@ -79,6 +79,7 @@ FRAME = Topic(
 )
 TRUTH = Topic("truth", _PIPELINE + "truth", messages.Truth, max_bytes=64 << 10)
 GUESS = Topic("guess", _PIPELINE + "guess", messages.Guess, max_bytes=64 << 10)
+RETRIEVED = Topic("retrieved", _PIPELINE + "retrieved", messages.Retrieved, max_bytes=64 << 10)
 VIEW = Topic("view", _PIPELINE + "view", messages.View, capacity=16, max_bytes=_IMAGE_BYTES, priority="data_low")
 MATCHES = Topic("matches", _PIPELINE + "matches", messages.Matches)
 CORRESPONDENCES = Topic("correspondences", _PIPELINE + "correspondences", messages.Correspondences)
@@ -88,7 +89,7 @@ STATE = Topic("state", _PIPELINE + "state", messages.State, max_bytes=64 << 10)
 STATS = Topic("stats", "{site}/stats/{object}/{camera}/{stage}", messages.Stats, capacity=256, max_bytes=16 << 10)
 
 ALL: tuple[Topic, ...] = (
-    FRAME, TRUTH, GUESS, VIEW, MATCHES, CORRESPONDENCES, ESTIMATE, POSE, STATE, STATS,
+    FRAME, TRUTH, GUESS, RETRIEVED, VIEW, MATCHES, CORRESPONDENCES, ESTIMATE, POSE, STATE, STATS,
 )  # fmt: skip
 BY_NAME: dict[str, Topic] = {topic.name: topic for topic in ALL}
 

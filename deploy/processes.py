@@ -87,6 +87,12 @@ def _tracking(launch: Launch) -> Handler:
     return TrackingNode(launch.needed_field(), launch.settings.tracking)
 
 
+def _retrieval(launch: Launch) -> Handler:
+    from stages.retrieval.node import RetrievalNode
+
+    return RetrievalNode(launch.needed_field(), launch.settings.retrieval, launch.settings.matching)
+
+
 def _rendering(launch: Launch) -> Handler:
     from stages.rendering.node import RenderingNode
 
@@ -127,6 +133,7 @@ TABLE: dict[str, ProcessSpec] = {
         ProcessSpec(RECORDER, _recorder, stop_s=60.0),
         ProcessSpec(CAMERA, _camera),
         ProcessSpec("tracking", _tracking),
+        ProcessSpec("retrieval", _retrieval),
         ProcessSpec("rendering", _rendering, parallel=True, renders=True),
         ProcessSpec("matching", _matching, parallel=True),
         ProcessSpec("lifting", _lifting, parallel=True, renders=True),

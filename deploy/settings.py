@@ -24,6 +24,7 @@ from stages.matching.core import MatchingConfig
 from stages.pnp.config import PnpConfig
 from stages.refinement.config import RefinementConfig
 from stages.rendering.config import RenderingConfig
+from stages.retrieval.config import RetrievalConfig
 from stages.tracking.config import TrackingConfig
 
 T = TypeVar("T")
@@ -38,6 +39,7 @@ class Settings:
     address: Address = field(default_factory=Address)
     camera: CameraConfig = field(default_factory=lambda: CameraConfig(source=""))
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    retrieval: RetrievalConfig = field(default_factory=RetrievalConfig)
     rendering: RenderingConfig = field(default_factory=RenderingConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
     lifting: LiftingConfig = field(default_factory=LiftingConfig)

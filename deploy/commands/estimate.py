@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from deploy.errors import UsageError
 from deploy.output import check_writable, write_bytes, write_json
 from deploy.settings import Settings
 from stages.geometry import Camera
@@ -23,9 +24,10 @@ _ASPECT_TOLERANCE = 0.01
 class Options:
     """Find the pose of one image, in this process and without a bus.
 
-    Example: fieldpose estimate out/lego.safetensors photo.png --guess train:r_10 --json out/pose.json
+    Example: fieldpose estimate out/lego.safetensors photo.png --json out/pose.json
 
-    Where the guess leads to no pose that is believed, training views are tried, the nearest first
+    Without a guess it begins with the training view that looks most like the image. Where a guess leads to no pose
+    that is believed, training views are tried: those that look like the image, then those nearest to the guess
     (--tracking.searches). Exits with 1 where no pose is found.
 
     The JSON file has: ok, reason, cam_from_object (4x4 by rows, OpenCV axes), covariance (6x6 of the left twist:
@@ -37,8 +39,8 @@ class Options:
     """The field (.safetensors) of the object or scene."""
     image: tyro.conf.Positional[Path]
     """The image; one with transparency is laid over white."""
-    guess: str
-    """train:NAME (the pose of a training view), or a JSON file {"cam_from_object": 4x4 by rows}."""
+    guess: str | None = None
+    """Where to begin: train:NAME (the pose of a training view), or a JSON file {"cam_from_object": 4x4 by rows}."""
     camera_file: Path | None = None
     """JSON file of the camera (short for --camera.camera-file); without it the camera that the training views were
     taken with, where the image has its shape, else what the image says of its focal length."""
@@ -61,8 +63,12 @@ class Options:
         check_writable(self.json, self.overlay)
         field = load_field(self.field)
         image, camera = self._image(field.metadata)
-        views = training_views(field.metadata)
-        guess = start_pose(self.guess, views)
+        views = training_views(field)
+        guess = None if self.guess is None else start_pose(self.guess, views)
+        if guess is None and views.descriptors is None:
+            raise UsageError(
+                f"{self.field}: this field does not know how its training views look; give --guess, or train it again"
+            )
         renderer = make_renderer(field, threads=0)
         finder = PoseFinder(renderer, self.settings, views)
         began = time.perf_counter()

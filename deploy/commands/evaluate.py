@@ -98,7 +98,7 @@ class Options:
         protocol = self._protocol(surface)
         drawn = pairs.draw(protocol, [record.cam_from_object for record in dataset.images], self.seeds)
         images, covered = shown(dataset, drawn, self._thing(protocol))
-        examination = Examination(renderer, training_views(field.metadata), dataset, images, drawn)
+        examination = Examination(renderer, training_views(field), dataset, images, drawn)
         warm_up(renderer, jacobian=True)
         about = {
             "protocol": dataclasses.asdict(protocol),

@@ -47,7 +47,7 @@ class Options:
     """Write a row for each frame into this file."""
     guess: str | None = None
     """Where to begin: perturb:10-40deg,0.2 (each frame's true pose, disturbed), train:NAME, or a JSON file; without
-    it the training views are tried one after another (short for --tracking.guess)."""
+    it, training views that look like the frame (short for --tracking.guess)."""
     size: int | None = None
     """Shrink images whose longer side has more pixels (short for --camera.size)."""
     pace: Pace | None = None

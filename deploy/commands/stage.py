@@ -32,8 +32,11 @@ class Options:
     """
 
     name: tyro.conf.Positional[
-        Literal["hub", "recorder", "camera", "tracking", "rendering", "matching", "lifting", "pnp", "refinement"]
-    ]
+        Literal[
+            "hub", "recorder", "camera", "tracking", "retrieval", "rendering", "matching", "lifting", "pnp",
+            "refinement",
+        ]
+    ]  # fmt: skip
     """Which process."""
     connect: str = LOCAL_HUB
     """Where the hub is."""

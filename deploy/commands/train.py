@@ -15,6 +15,7 @@ import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from deploy.output import check_writable, progress_console, write_json
+from stages.errors import WeightsError
 from stages.nerf.config import FieldConfig, TrainingConfig
 
 if TYPE_CHECKING:
@@ -59,12 +60,26 @@ class Options:
         holdout = None if self.holdout == "none" else self.holdout
         began = time.monotonic()
         with _progress_bar() as report:
-            trained = train_field(self.dataset, self.out, self.size, holdout, training, self.model, report)
+            trained = train_field(self.dataset, self.out, self.size, holdout, training, self.model, report, _memory())
         figures = _figures(trained, self.out)
         write_json(self.json, figures)
         print(f"{self.out}: {_quality(trained)}; {figures['size_bytes'] / 1e6:.1f} MB, ", end="")
         print(f"{figures['steps']} steps in {figures['seconds']:.0f} s, all in {time.monotonic() - began:.0f} s")
         return 0
+
+
+def _memory() -> Callable[[list[np.ndarray]], np.ndarray] | None:
+    """Makes what the field remembers of its training views; None, said on stderr, where the weights are missing."""
+    from stages.matching.core import MatchingConfig
+    from stages.retrieval.core import RetrievalConfig, describer, remembered
+
+    try:
+        describe = describer(RetrievalConfig(), MatchingConfig())
+    except WeightsError as error:
+        said = f"the field will not remember its training views, for retrieval: {error}"
+        progress_console().print(said, soft_wrap=True)
+        return None
+    return lambda images: remembered([describe(image) for image in images])
 
 
 def _figures(trained: TrainedField, out: Path) -> dict[str, Any]:

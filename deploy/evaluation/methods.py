@@ -39,6 +39,20 @@ class Method:
     ablates: str | None = None
 
 
+class _FromLookalikes:
+    """Our steps from the training views that look like the image, whatever the guess is; all rendered beforehand."""
+
+    def __init__(self, finder: PoseFinder) -> None:
+        self._finder = finder
+        self._prepared: Camera | None = None
+
+    def find(self, image: np.ndarray, camera: Camera, guess: np.ndarray) -> PoseFound:
+        if camera != self._prepared:
+            self._finder.prepare(camera)
+            self._prepared = camera
+        return self._finder.find(image, camera)
+
+
 class _Baseline:
     """A published method of tests/benchmark/baselines; it always believes its answer."""
 
@@ -57,6 +71,16 @@ def _ours(change: Callable[[Settings], Settings], ablates: str | None = None) ->
         return PoseFinder(renderer, change(alone), views)
 
     return Method(make, ablates=ablates)
+
+
+def _retrieved(change: Callable[[Settings], Settings]) -> Method:
+    def make(renderer: RayRenderer, settings: Settings, views: TrainingViews) -> Finder:
+        rendering = replace(settings.rendering, cache_mb=_PREPARED_MB)
+        matching = replace(settings.matching, kept_views=len(views.names))
+        prepared = replace(settings, rendering=rendering, matching=matching)
+        return _FromLookalikes(PoseFinder(renderer, change(prepared), views))
+
+    return Method(make)
 
 
 def _published(name: str, *, slow: bool = True, scale_known: bool = True, **config: Any) -> Method:
@@ -96,6 +120,8 @@ METHODS: dict[str, Method] = {
     "one-step-refined": _ours(_refined_step),
     "one-step-refined-anywhere": _ours(_anywhere, ablates="one-step-refined"),
     "one-step-refined-adam": _ours(_adam, ablates="one-step-refined"),
+    "retrieved": _retrieved(_one_step),
+    "retrieved-refined": _retrieved(_refined_step),
     "passes": _ours(_passes),
     "full": _ours(lambda settings: settings),
     "essential": _published("essential", slow=False, scale_known=False),
@@ -109,5 +135,7 @@ pixels around the keypoints or, -anywhere, of the whole image, -adam, by the pap
 tracking.passes of them, from other guesses where the first leads nowhere; full: those and refinement. essential:
 rotations from matches alone; inerf, -2048: with so many rays a step; pi-nerf, -camera: turned about the camera and
 drawn less widely, closer to its publication; these five are in tests/benchmark/baselines."""
+
+_PREPARED_MB = 4096.0
 
 DEFAULT = ("one-step", "one-step-unmined", "passes", "full")

@@ -7,14 +7,16 @@ point is looked at again from nearby views, and discarded where they do not see 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from stages.geometry import Camera, rays
 from stages.lifting.config import LiftingConfig
+from stages.lifting.memory import ConsistencyMemory
 from stages.nerf.rendering_api import RayRenderer
 
-__all__ = ["Lifted", "LiftingConfig", "consistency", "depth_at", "lift"]
+__all__ = ["ConsistencyMemory", "Lifted", "LiftingConfig", "consistency", "depth_at", "lift"]
 
 _NEVER = np.float32(np.finfo(np.float32).max)
 
@@ -40,11 +42,14 @@ def lift(
     pixels_in_view: np.ndarray,
     rng: np.random.Generator,
     config: LiftingConfig | None = None,
+    view_id: str = "",
+    memory: ConsistencyMemory | None = None,
 ) -> Lifted:
     """Lift pixels (n, 2) of a view and mark the points to keep.
 
     depth (h, w) along the optical axis, opacity (h, w) in 0..1 or uint8, camera and cam_from_object are the view's.
-    `rng` turns the ring of nearby views; the renderer is asked once, for all points and views.
+    `rng` turns the ring of nearby views; the renderer is asked once, for all points and views, or for those alone of
+    which `memory` knows nothing under the view_id.
     """
     config = config or LiftingConfig()
     depths = depth_at(depth, pixels_in_view, config.max_depth_step)
@@ -55,7 +60,8 @@ def lift(
     points = origins + depths[:, None] * directions
     spread = np.full(len(points), _NEVER, np.float32)
     if seen.any():
-        spread[seen] = consistency(renderer, points[seen], origins[0], rng, config)
+        look = partial(_look, renderer, points[seen], origins[0], rng, config)
+        spread[seen] = look() if memory is None else memory.get(view_id, pixels_in_view[seen], look)
     unit = 1.0 if config.gamma_unit == "field" else depths / camera.fx
     displacement = np.where(seen, np.sqrt(spread) / np.maximum(config.gamma * unit, 1e-12), np.inf)
     return Lifted(points, spread, _consistent(displacement, config))
@@ -106,6 +112,13 @@ def consistency(
     off = (rendered.depth.reshape(directions.shape[:2]) - 1)[..., None] * directions
     squared = (off**2).sum(axis=2)
     return (np.median if config.statistic == "median" else np.mean)(squared, axis=0).astype(np.float32)
+
+
+def _look(
+    renderer: RayRenderer, points: np.ndarray, camera_centre: np.ndarray, rng: np.random.Generator,
+    config: LiftingConfig, index: np.ndarray | slice = slice(None),
+) -> np.ndarray:  # fmt: skip
+    return consistency(renderer, points[index], camera_centre, rng, config)
 
 
 def _nearby_centres(

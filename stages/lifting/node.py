@@ -12,7 +12,7 @@ from bus.messages import Correspondences, Guess, Header, Matches, Message, Reaso
 from bus.node import JoinedHandler, Output, reply_header
 from bus.topics import CORRESPONDENCES, GUESS, MATCHES, VIEW, Topic
 from stages.lifting.config import LiftingConfig
-from stages.lifting.core import lift
+from stages.lifting.core import ConsistencyMemory, lift
 from stages.nerf.loading import load_renderer, warm_up
 from stages.wire import NO_CAMERA, camera_of, frame_rng
 
@@ -29,7 +29,7 @@ class LiftingNode(JoinedHandler):
         self._field, self._config, self._threads = field, config, threads
 
     def start(self) -> None:
-        self._renderer = load_renderer(self._field, self._threads)
+        self._renderer, self._memory = load_renderer(self._field, self._threads), ConsistencyMemory()
         warm_up(self._renderer)
 
     def process(self, joined: dict[Topic, Message]) -> Iterable[Output]:
@@ -37,7 +37,7 @@ class LiftingNode(JoinedHandler):
         guess, header = cast(Guess, joined[GUESS]), reply_header(matches.header)
         lifted = lift(
             self._renderer, view.depth, view.opacity, camera_of(view.camera), np.array(view.cam_from_object),
-            matches.pixels_in_view, frame_rng(header), self._config,
+            matches.pixels_in_view, frame_rng(header), self._config, view.view_id, self._memory,
         )  # fmt: skip
         ok = bool(lifted.kept.sum() >= self._config.min_kept)
         reason = Reason.OK if ok else Reason.TOO_FEW_CONSISTENT_POINTS

@@ -29,7 +29,7 @@ MATCHERS = {
 }
 """Name in the configuration -> module and the callable in it that makes a Matcher of a MatchingConfig."""
 
-_KEPT_VIEWS, _KEPT_FRAMES = 16, 2
+_KEPT_FRAMES = 2
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,8 @@ class MatchingConfig:
     """side of the patches that place coarse matches between pixels; 0 leaves them where the matcher put them"""
     erode_px: int = 0
     """how far inside the silhouette a pixel of the view must lie to be matched"""
+    kept_views: int = 32
+    """features of so many views are kept, for views that come again"""
     weights: Path | None = None
     """file or folder of network weights, in place of an installed package's"""
     allow_download: bool = False
@@ -123,7 +125,7 @@ class PairMatcher:
 
     def __init__(self, matcher: Matcher, config: MatchingConfig) -> None:
         self._matcher, self._config = matcher, config
-        self._views, self._frames = _LastUsed(_KEPT_VIEWS), _LastUsed(_KEPT_FRAMES)
+        self._views, self._frames = _LastUsed(config.kept_views), _LastUsed(_KEPT_FRAMES)
 
     def match(
         self,
@@ -137,10 +139,8 @@ class PairMatcher:
 
         Only pixels of the view that show the object are matched. Features are kept under the keys, where given.
         """
-        longer_side = self._config.frame_size or max(view_rgb.shape[:2])
         view = self._views.get(view_key, lambda: self._of_view(view_rgb, view_opacity))
-        sized_key = None if frame_key is None else (frame_key, longer_side)
-        frame = self._frames.get(sized_key, lambda: self._of_frame(frame_image, longer_side))
+        frame = self._frame(frame_image, self._config.frame_size or max(view_rgb.shape[:2]), frame_key)
         matched = self._matcher.match(view.features, frame.features)
         pixels_b, confidence = matched.pixels_b, matched.confidence
         if self._config.patch_px and not self._matcher.placed_between_pixels:
@@ -149,6 +149,20 @@ class PairMatcher:
             confidence = confidence * factor
         in_frame = ((pixels_b + 0.5) / frame.scale - 0.5).astype(np.float32)
         return MatchedPixels(matched.pixels_a, in_frame, confidence)
+
+    def view_features(self, rgb: np.ndarray, opacity: np.ndarray, view_key: Hashable) -> Features:
+        """The features of a view (h, w, 3) uint8 with opacity (h, w); kept for a match, as there."""
+        seen: _Seen = self._views.get(view_key, lambda: self._of_view(rgb, opacity))
+        return seen.features
+
+    def frame_features(self, frame_image: np.ndarray, longer_side: int, frame_key: Hashable | None = None) -> Features:
+        """The features of a frame (h, w, 3) uint8, shrunk to `longer_side`; kept for a match, as there."""
+        return self._frame(frame_image, self._config.frame_size or longer_side, frame_key).features
+
+    def _frame(self, image: np.ndarray, longer_side: int, key: Hashable | None) -> _Seen:
+        sized_key = None if key is None else (key, longer_side)
+        seen: _Seen = self._frames.get(sized_key, lambda: self._of_frame(image, longer_side))
+        return seen
 
     def _of_view(self, rgb: np.ndarray, opacity: np.ndarray) -> _Seen:
         features = self._matcher.extract(rgb, visible_mask(opacity, self._config.erode_px))

@@ -17,16 +17,21 @@ from stages.nerf.kernels.types import SH_SIZE, Domain, Net
 from stages.nerf.metadata import FORMAT_VERSION, FieldMetadata, Space
 from stages.nerf.occupancy import pack
 
+DESCRIPTOR_SIZE = 64
 LEARNT = ("table", "w1", "w2", "c1", "c2", "c3")
 
 
 @dataclass
 class Field:
-    """`net` holds the learnt arrays; `occupied` is (n, n, n) bool, indexed [z, y, x] over the unit cube."""
+    """`net` holds the learnt arrays; `occupied` is (n, n, n) bool, indexed [z, y, x] over the unit cube.
+
+    descriptors: (views, keypoints, 64) int8, how the training views look, for retrieval; None if that is not known.
+    """
 
     metadata: FieldMetadata
     net: Net
     occupied: np.ndarray
+    descriptors: np.ndarray | None = None
 
     def domain(self) -> Domain:
         """The domain that the kernels march through."""
@@ -37,6 +42,8 @@ class Field:
         arrays = {name: getattr(self.net, name) for name in LEARNT}
         arrays["table"] = arrays["table"].astype(np.float16)
         arrays["occupied"] = np.packbits(self.occupied.ravel(), bitorder="little")
+        if self.descriptors is not None:
+            arrays["descriptors"] = self.descriptors
         text = msgspec.json.encode(self.metadata).decode()
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_name(path.name + ".partial")
@@ -117,4 +124,14 @@ def _assemble(arrays: dict[str, np.ndarray], metadata: FieldMetadata) -> Field:
             raise ValueError(f"array {name} has shape {array.shape} or values that are not finite, expected {expected}")
     n = config.occupancy_resolution
     occupied = np.unpackbits(arrays["occupied"], bitorder="little", count=n**3).astype(bool).reshape(n, n, n)
-    return Field(metadata, template._replace(**learnt), occupied)
+    return Field(metadata, template._replace(**learnt), occupied, _descriptors(arrays, len(metadata.cameras)))
+
+
+def _descriptors(arrays: dict[str, np.ndarray], views: int) -> np.ndarray | None:
+    descriptors = arrays.get("descriptors")
+    if descriptors is None:
+        return None
+    if descriptors.dtype != np.int8 or descriptors.ndim != 3 or descriptors.shape[::2] != (views, DESCRIPTOR_SIZE):
+        got = f"{descriptors.dtype} of shape {descriptors.shape}"
+        raise ValueError(f"array descriptors is {got}, expected int8 of shape ({views}, any, {DESCRIPTOR_SIZE})")
+    return descriptors

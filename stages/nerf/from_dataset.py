@@ -14,6 +14,7 @@ import numpy as np
 
 from stages.nerf.config import FieldConfig, TrainingConfig
 from stages.nerf.datasets import Dataset, load_dataset
+from stages.nerf.datasets.images import over_background
 from stages.nerf.field import Field
 from stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
 from stages.nerf.raybank import View
@@ -102,9 +103,11 @@ def train_field(
     training: TrainingConfig | None = None,
     config: FieldConfig | None = None,
     report: Callable[[TrainingReport], None] = lambda _: None,
+    remember: Callable[[list[np.ndarray]], np.ndarray] | None = None,
 ) -> TrainedField:
     """Train on a dataset's training images, measure on its held-out ones, and save; Ctrl-C ends the training early.
 
+    remember: makes the field's descriptors of the training images, (h, w, 3) uint8; without it the field has none.
     Raises DatasetError; nothing is written before the training is over.
     """
     training, config = training or TrainingConfig(), config or FieldConfig()
@@ -123,6 +126,8 @@ def train_field(
     field = trainer.field(
         replace_metadata(metadata, trained_seconds=time.monotonic() - start, trained_steps=trainer.steps)
     )
+    if remember is not None:
+        field.descriptors = remember([over_background(view.image, dataset.background) for view in views])
     field.save(out)
     scores = evaluate(NumbaRenderer(field, training.threads), held_out) if held_out and not interrupted else []
     if scores:

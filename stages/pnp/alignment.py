@@ -23,6 +23,8 @@ _LOOSER = 1.4
 """Errors before a round are larger than after the last by this and by how coarse the round is."""
 _FLATTEST, _STEEPEST = 0.15, 6.0
 """Patches that cover less or more of the frame than these shares of themselves are seen too differently."""
+_ENOUGH = 300
+"""So many points are enough to come nearer; all of them are looked for at the end."""
 _BASELINE_PX = 2
 _NO_SURFACE = np.float32(1e3)
 _HALF_PX = np.array([[0.0, 0.0], [-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
@@ -80,6 +82,8 @@ class Aligner:
         warp = np.stack([around[:, 2] - around[:, 1], around[:, 4] - around[:, 3]], axis=2)
         determinant = np.linalg.det(np.where(seen[:, None, None], warp, 0.0))
         index = np.flatnonzero(seen & (determinant > _FLATTEST) & (determinant < _STEEPEST))
+        if level > 0:
+            index = index[:: -(-len(index) // _ENOUGH) or 1]
         places, similarity = np.empty((len(index), 2), np.float32), np.empty(len(index), np.float32)
         find_patches(
             _blurred(self._view, level), _blurred(self._frame, level), self._pixels[index].astype(np.float32),

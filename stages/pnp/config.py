@@ -17,7 +17,7 @@ class PnpConfig:
     """at most so many samples of three points"""
     confidence: float = 0.99999
     """RANSAC stops when a better pose would have been seen with this probability"""
-    least_iterations: int = 500
+    least_iterations: int = 100
     """at least so many"""
     min_inliers: int = 8
     """fewer inliers are no pose"""

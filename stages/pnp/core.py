@@ -15,7 +15,7 @@ from stages.errors import StageError
 from stages.geometry import Camera, camera_centre, is_rigid, twist_covariance, viewing_angles
 from stages.pnp.alignment import Aligner, Pictures
 from stages.pnp.config import PnpConfig
-from stages.pnp.least_squares import CONVERGED, PoseFit, fit_pose, reprojection
+from stages.pnp.least_squares import CONVERGED, PoseFit, distances_px, fit_pose
 
 __all__ = ["Pictures", "PnpConfig", "PnpResult", "solve", "warm_up"]
 
@@ -89,13 +89,14 @@ def solve(
     fit, pose = found.fit, found.fit.cam_from_object
     angles = viewing_angles(points[found.index], pose if seen_from is None else seen_from, pose)
     shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles) * count / len(found.index))
-    covariance = twist_covariance(fit.jacobian, fit.weights, found.pixels, longer_side, fit.variance, shared)
+    residuals, jacobian = fit.errors
+    covariance = twist_covariance(jacobian, fit.weights, found.pixels, longer_side, fit.variance, shared)
     distance = float(np.median(np.linalg.norm(points[found.index] - camera_centre(pose), axis=1)))
     if not _plausible(covariance, found.pixels, longer_side, distance, config):
         return _failed("implausible_pose", count)
     inliers, in_frame = np.zeros(count, bool), found.pixels.astype(np.float32)
     inliers[found.index] = True
-    rms = float(np.sqrt((fit.residuals_px**2).sum(axis=1).mean()))
+    rms = float(np.sqrt((residuals**2).sum(axis=1).mean()))
     return PnpResult(True, "ok", pose, inliers, in_frame, rms, covariance)
 
 
@@ -221,8 +222,7 @@ def _polish(
     """Fit the inliers and choose them anew by the fit, in turn; None where they become too few."""
     pose, fit, inliers = cam_from_object, None, np.zeros(len(pixels), bool)
     for _ in range(_ROUNDS):
-        residuals, _ = reprojection(pixels, points, camera, pose)
-        agreeing = np.linalg.norm(residuals, axis=1) <= threshold
+        agreeing = distances_px(pixels, points, camera, pose) <= threshold
         if agreeing.sum() < max(config.min_inliers, _MIN_POINTS):
             return None, agreeing
         if fit is not None and np.array_equal(agreeing, inliers):

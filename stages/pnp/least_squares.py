@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
 
-from stages.geometry import Camera, exp_se3
+from stages.geometry import Camera
 
 _MAX_STEPS = 20
 CONVERGED = 1e-5
@@ -19,18 +20,24 @@ _MEDIAN_TO_SIGMA = 1.1774
 
 @dataclass(frozen=True)
 class PoseFit:
-    """cam_from_object (4, 4), the residuals (n, 2) in pixels with derivatives (n, 2, 6), weights (n,)."""
+    """cam_from_object (4, 4), and what it was fitted to: pixels (n, 2), points (n, 3), the camera, weights (n,)."""
 
     cam_from_object: np.ndarray
-    residuals_px: np.ndarray
-    jacobian: np.ndarray
+    pixels: np.ndarray
+    points: np.ndarray
+    camera: Camera
     weights: np.ndarray
+
+    @cached_property
+    def errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """The residuals (n, 2) in pixels and their derivatives (n, 2, 6), as `reprojection` has them."""
+        return reprojection(self.pixels, self.points, self.camera, self.cam_from_object)
 
     @property
     def variance(self) -> float:
         """Of a residual of weight 1 as Huber's loss sees it; Huber, Robust Statistics (1981), section 7.6."""
-        length = _lengths(self.residuals_px, self.weights)
-        delta = _huber_width(length)
+        length = np.sqrt(self.weights) * np.linalg.norm(self.errors[0], axis=1)
+        delta = huber_width(length)
         freedom = max(2 * len(length) - 6, 1)
         slope = np.where(length <= delta, 1.0, delta / (2 * np.maximum(length, 1e-12))).mean()
         return float((np.minimum(length, delta) ** 2).sum() / freedom / slope**2)
@@ -49,29 +56,24 @@ def fit_pose(
     pixels (n, 2) of an undistorted camera, points (n, 3) in object coordinates, weights (n,) of squared errors;
     converged: the length of a twist, in radians and shares of the points' distance, that is the last step.
     """
-    pose, damping = cam_from_object, 1e-6
     pixels, points, weights = (np.ascontiguousarray(given, np.float64) for given in (pixels, points, weights))
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    lengths, moved_lengths = np.empty(len(points)), np.empty(len(points))
-    gradient, hessian = np.empty(6), np.empty((6, 6))
-    distance = np.linalg.norm(np.median(points, axis=0) @ pose[:3, :3].T + pose[:3, 3])
-    unit = np.array([max(distance, 1e-12)] * 3 + [1.0] * 3)
-    weighted_lengths(pixels, points, intrinsics, pose, weights, lengths)
-    for _ in range(_MAX_STEPS):
-        delta = _huber_width(lengths)
-        normal_equations(pixels, points, intrinsics, pose, weights, delta, gradient, hessian)
-        hessian[np.diag_indices(6)] *= 1 + damping
-        step = -np.linalg.solve(hessian + 1e-12 * np.eye(6), gradient)
-        moved = exp_se3(step) @ pose
-        weighted_lengths(pixels, points, intrinsics, moved, weights, moved_lengths)
-        if _huber_cost(moved_lengths, delta) <= _huber_cost(lengths, delta):
-            pose, damping = moved, damping / 10
-            lengths, moved_lengths = moved_lengths, lengths
-        else:
-            damping *= 100
-        if np.linalg.norm(step / unit) < converged:
-            break
-    return PoseFit(pose, *reprojection(pixels, points, camera, pose), weights)
+    distance = np.linalg.norm(np.median(points, axis=0) @ cam_from_object[:3, :3].T + cam_from_object[:3, 3])
+    pose = np.array(cam_from_object, np.float64)
+    descend(pixels, points, intrinsics_of(camera), weights, max(float(distance), 1e-12), converged, pose)
+    return PoseFit(pose, pixels, points, camera, weights)
+
+
+def distances_px(pixels: np.ndarray, points: np.ndarray, camera: Camera, cam_from_object: np.ndarray) -> np.ndarray:
+    """Lengths (n,) of the reprojection errors; infinite behind the camera. Arrays as for fit_pose."""
+    lengths = np.empty(len(points))
+    pose = np.ascontiguousarray(cam_from_object, np.float64)
+    weighted_lengths(pixels, points, intrinsics_of(camera), pose, np.ones(len(points)), lengths)
+    return lengths
+
+
+def intrinsics_of(camera: Camera) -> np.ndarray:
+    """fx, fy, cx and cy."""
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
 @njit(inline="always")
@@ -134,6 +136,74 @@ def normal_equations(
             hessian[b, a] = hessian[a, b]
 
 
+@njit(nogil=True)
+def huber_width(lengths: np.ndarray) -> float:
+    """Up to which length of weighted residuals (n,) Huber's loss is quadratic."""
+    middle = lengths.shape[0] // 2
+    return max(_HUBER * np.partition(lengths, middle)[middle] / _MEDIAN_TO_SIGMA, 1e-6)
+
+
+@njit(nogil=True)
+def huber_cost(lengths: np.ndarray, delta: float) -> float:
+    """Sum over weighted residuals (n,)."""
+    total = 0.0
+    for length in lengths:
+        total += length * length if length <= delta else delta * (2 * length - delta)
+    return total
+
+
+@njit(nogil=True)
+def turned(step: np.ndarray, pose: np.ndarray, out: np.ndarray) -> None:
+    """exp(step) @ pose (4, 4) into out, for a twist (6,); `exp_se3` is its plain twin."""
+    w0, w1, w2 = step[3], step[4], step[5]
+    squared = w0 * w0 + w1 * w1 + w2 * w2
+    angle = math.sqrt(squared)
+    if angle < 1e-3:
+        a, b, c = 1 - squared / 6, 0.5 - squared / 24, 1 / 6 - squared / 120
+    else:
+        a = math.sin(angle) / angle
+        b, c = 2 * math.sin(angle / 2) ** 2 / squared, (1 - a) / squared
+    cross = np.array([[0.0, -w2, w1], [w2, 0.0, -w0], [-w1, w0, 0.0]])
+    for i in range(3):
+        for j in range(4):
+            out[i, j] = pose[i, j]
+            for k in range(3):
+                twice = cross[i, 0] * cross[0, k] + cross[i, 1] * cross[1, k] + cross[i, 2] * cross[2, k]
+                out[i, j] += (a * cross[i, k] + b * twice) * pose[k, j]
+                if j == 3:
+                    out[i, j] += ((1.0 if i == k else 0.0) + b * cross[i, k] + c * twice) * step[k]
+    out[3] = pose[3]
+
+
+@njit(nogil=True, cache=True)
+def descend(
+    pixels: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, weights: np.ndarray, distance: float,
+    converged: float, pose: np.ndarray,
+) -> None:  # fmt: skip
+    """Move a pose (4, 4) to the nearest minimum of Huber's loss by Levenberg-Marquardt. All float64."""
+    lengths, moved_lengths = np.empty(points.shape[0]), np.empty(points.shape[0])
+    gradient, hessian, moved = np.empty(6), np.empty((6, 6)), np.empty((4, 4))
+    damping = 1e-6
+    weighted_lengths(pixels, points, intrinsics, pose, weights, lengths)
+    for _ in range(_MAX_STEPS):
+        delta = huber_width(lengths)
+        normal_equations(pixels, points, intrinsics, pose, weights, delta, gradient, hessian)
+        for i in range(6):
+            hessian[i, i] = hessian[i, i] * (1 + damping) + 1e-12
+        step = -np.linalg.solve(hessian, gradient)
+        turned(step, pose, moved)
+        weighted_lengths(pixels, points, intrinsics, moved, weights, moved_lengths)
+        if huber_cost(moved_lengths, delta) <= huber_cost(lengths, delta):
+            pose[:] = moved
+            lengths[:] = moved_lengths
+            damping /= 10
+        else:
+            damping *= 100
+        step[:3] /= distance
+        if np.linalg.norm(step) < converged:
+            break
+
+
 def reprojection(
     pixels: np.ndarray, points: np.ndarray, camera: Camera, cam_from_object: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -150,16 +220,3 @@ def reprojection(
     residuals = np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], axis=1) - pixels
     residuals[z <= 0] = np.inf
     return residuals, jacobian
-
-
-def _lengths(residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    return np.sqrt(weights) * np.linalg.norm(residuals, axis=1)
-
-
-def _huber_width(lengths: np.ndarray) -> float:
-    middle = len(lengths) // 2
-    return max(_HUBER * float(np.partition(lengths, middle)[middle]) / _MEDIAN_TO_SIGMA, 1e-6)
-
-
-def _huber_cost(lengths: np.ndarray, delta: float) -> float:
-    return float(np.where(lengths <= delta, lengths**2, delta * (2 * lengths - delta)).sum())

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+_DEFAULT_SIZE = 400
+
 
 @dataclass(frozen=True)
 class RenderingConfig:
@@ -21,3 +23,8 @@ class RenderingConfig:
     """a next pass over the same frame wants a view that is nearer than the last: its share of the two limits"""
     cache_mb: float = 64.0
     """memory for cached views; the longest unused ones are forgotten"""
+
+    @property
+    def longer_side(self) -> int:
+        """Of views, where the frame is no smaller."""
+        return self.size or _DEFAULT_SIZE

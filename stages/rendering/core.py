@@ -15,7 +15,6 @@ from stages.rendering.config import RenderingConfig
 __all__ = ["RenderingConfig", "SourcedView", "ViewSource", "view_camera"]
 
 _PROBES = 256
-_DEFAULT_SIZE = 400
 
 
 @dataclass(frozen=True)
@@ -37,22 +36,23 @@ class ViewSource:
 
     def view(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool = False) -> SourcedView:
         """The view of a frame's camera (undistorted, shrunk) at the guess or near it; nearer in a next pass."""
-        small = view_camera(camera, self._config.size or _DEFAULT_SIZE)
-        found = self._near(small, cam_from_object, self._config.next_pass_share if next_pass else 1.0)
+        small = view_camera(camera, self._config.longer_side)
+        view_id = _view_id(self._field_id, small, cam_from_object)
+        found = view_id if view_id in self._cache else self._near(small, cam_from_object, next_pass)
         if found is not None:
             self._cache.move_to_end(found)
             cached = self._cache[found]
             return SourcedView(cached.view, found, True, cached.visible)
         view = self._renderer.render_view(small, cam_from_object)
-        view_id = _view_id(self._field_id, small, cam_from_object)
         cached = _Cached(view, float((view.opacity > 0.5).mean()), _probes(view))
         self._keep(view_id, cached)
         return SourcedView(view, view_id, False, cached.visible)
 
-    def _near(self, camera: Camera, cam_from_object: np.ndarray, share: float) -> str | None:
-        """The id of the cached view with the smallest shift among those within a share of the limits."""
+    def _near(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool) -> str | None:
+        """The id of the cached view with the smallest shift among those within the limits."""
         if self._config.reuse_angle_deg <= 0:
             return None
+        share = self._config.next_pass_share if next_pass else 1.0
         best, best_shift = None, share * self._config.reuse_shift
         for view_id, cached in self._cache.items():
             if cached.view.camera == camera:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from stages.geometry import perturb
 from stages.tracking.config import TrackingConfig
 from stages.tracking.distance import Limit
 from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
+from stages.tracking.retrieved import Poses
 from stages.tracking.scoring import believed, score
 from stages.tracking.views import TrainingViews, nearest_first
 
@@ -21,21 +22,28 @@ _TRUTHS_KEPT = 256
 
 @dataclass
 class _Trial:
-    """A frame in flight: its guess, the newest believed result, and the training views to try (None: not asked for)."""
+    """A frame in flight: the poses that have been tried, its guess first, and the newest believed result."""
 
-    guess: np.ndarray
+    tried: list[np.ndarray]
     found: PoseResult | None = None
-    others: list[np.ndarray] | None = None
 
 
 class EachFramePolicy:
     """Frames with guesses of their own, by frame_id; each pass begins where the pass before ended.
 
-    Where the guess leads to no pose that is believed, training views are tried in its place. A pose that is not
-    believed is none; with a single pass there is nothing to confirm it by, and every usable one counts.
+    Where the guess leads to no pose that is believed, training views are tried in its place: those that look like
+    the frame, as `retrieved` says, then those nearest to the guess. A pose that is not believed is none; with a
+    single pass there is nothing to confirm it by, and every usable one counts.
     """
 
-    def __init__(self, config: TrackingConfig, views: TrainingViews, guesses: Mapping[int, np.ndarray]) -> None:
+    def __init__(
+        self,
+        config: TrackingConfig,
+        views: TrainingViews,
+        guesses: Mapping[int, np.ndarray],
+        retrieved: Callable[[FrameInfo], Poses] = lambda frame: (),
+    ) -> None:
+        self._retrieved = retrieved
         self._config = config
         self._views = views
         self._scale = views.scale
@@ -51,7 +59,7 @@ class EachFramePolicy:
         guess = self._guesses.get(frame.frame_id)
         if guess is None:
             return None
-        self._trials[frame.frame_id] = _Trial(guess)
+        self._trials[frame.frame_id] = _Trial([guess])
         return PoseGuess(GuessReason.PRIOR, guess)
 
     def next_guess(self, attempt: Attempt, result: PoseResult) -> PoseGuess | None:
@@ -65,10 +73,7 @@ class EachFramePolicy:
                 return PoseGuess(GuessReason.NEXT_PASS, pose)
         if self._config.passes == 1 or trial.found is not None:
             return None
-        if trial.others is None:
-            trial.others = self._other_guesses(trial.guess)
-        left = trial.others[attempt.retries :]
-        return PoseGuess(GuessReason.RELOCALISATION, left[0]) if left else None
+        return self._search(attempt.frame, trial)
 
     def conclude(self, attempt: Attempt, result: PoseResult) -> Belief:
         """The newest pose that was believed, TRACKING; LOST without one."""
@@ -92,11 +97,18 @@ class EachFramePolicy:
             return self._quality(result) >= self._config.score.usable
         return believed(result, attempt.guess.cam_from_object, self._config, self._scale)
 
-    def _other_guesses(self, guess: np.ndarray) -> list[np.ndarray]:
-        """Training views in the order in which they are tried."""
+    def _search(self, frame: FrameInfo, trial: _Trial) -> PoseGuess | None:
+        """The next training view to try; None when as many have been as may be."""
+        if len(trial.tried) > self._config.searches:
+            return None
         cover = Limit(self._config.cover_deg, self._config.cover * self._scale)
-        order = nearest_first(self._views.cam_from_object, guess, cover)
-        return [self._views.cam_from_object[i] for i in order[: self._config.searches]]
+        poses = self._views.cam_from_object
+        alike, near = self._retrieved(frame), poses[nearest_first(poses, trial.tried[0], cover)]
+        for pose, apart in (*((pose, self._settled) for pose in alike), *((pose, cover) for pose in near)):
+            if not any(apart.holds(pose, tried) for tried in trial.tried):
+                trial.tried.append(pose)
+                return PoseGuess(GuessReason.RELOCALISATION, pose)
+        return None
 
 
 @dataclass(frozen=True)
@@ -113,9 +125,15 @@ class PerturbedTruthPolicy(EachFramePolicy):
     A frame's disturbance depends on the seed and its frame_id alone. A frame has no guess until its truth is known.
     """
 
-    def __init__(self, config: TrackingConfig, views: TrainingViews, disturbance: Disturbance) -> None:
+    def __init__(
+        self,
+        config: TrackingConfig,
+        views: TrainingViews,
+        disturbance: Disturbance,
+        retrieved: Callable[[FrameInfo], Poses] = lambda frame: (),
+    ) -> None:
         self._known: OrderedDict[int, np.ndarray] = OrderedDict()
-        super().__init__(config, views, self._known)
+        super().__init__(config, views, self._known, retrieved)
         self._disturbance = disturbance
 
     def on_truth(self, frame_id: int, cam_from_object: np.ndarray | None) -> None:

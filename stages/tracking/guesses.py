@@ -15,6 +15,7 @@ from stages.geometry import is_rigid, nearest_rigid
 from stages.tracking.config import TrackingConfig
 from stages.tracking.frame_policies import Disturbance, EachFramePolicy, PerturbedTruthPolicy
 from stages.tracking.policy import Policy
+from stages.tracking.retrieved import RetrievedPoses
 from stages.tracking.track_policy import TrackPolicy
 from stages.tracking.views import TrainingViews
 
@@ -30,17 +31,17 @@ class GuessFile:
     frames: dict[int, np.ndarray] = field(default_factory=dict)
 
 
-def make_policy(config: TrackingConfig, views: TrainingViews) -> Policy:
-    """The policy that `config.guess` asks for. Raises ConfigError."""
-    spec = config.guess
+def make_policy(config: TrackingConfig, views: TrainingViews, retrieved: RetrievedPoses | None = None) -> Policy:
+    """The policy that `config.guess` asks for; it looks into `retrieved`. Raises ConfigError."""
+    spec, retrieved = config.guess, retrieved or RetrievedPoses()
     if spec is not None and spec.startswith("perturb:"):
-        return PerturbedTruthPolicy(config, views, disturbance(spec))
+        return PerturbedTruthPolicy(config, views, disturbance(spec), retrieved.of)
     if spec is None or spec.startswith("train:"):
-        return TrackPolicy(config, views, None if spec is None else start_pose(spec, views))
+        return TrackPolicy(config, views, None if spec is None else start_pose(spec, views), retrieved)
     content = read_guess_file(Path(spec))
     if content.frames:
-        return EachFramePolicy(config, views, content.frames)
-    return TrackPolicy(config, views, content.start)
+        return EachFramePolicy(config, views, content.frames, retrieved.of)
+    return TrackPolicy(config, views, content.start, retrieved)
 
 
 def needs_truth(spec: str | None) -> bool:
@@ -54,9 +55,7 @@ def start_pose(spec: str, views: TrainingViews) -> np.ndarray:
         return views.pose_of(spec.removeprefix("train:"))
     start = read_guess_file(Path(spec)).start
     if start is None:
-        raise ConfigError(
-            f'{spec}: holds a guess for each frame, but one pose is needed: {{"cam_from_object": ...}}'
-        )
+        raise ConfigError(f'{spec}: holds a guess for each frame, but one pose is needed: {{"cam_from_object": ...}}')
     return start
 
 
@@ -76,9 +75,7 @@ def read_guess_file(path: Path) -> GuessFile:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise ConfigError(
-            f"guess {str(path)!r}: no such file; or write train:NAME or perturb:10-40deg,0.2"
-        ) from None
+        raise ConfigError(f"guess {str(path)!r}: no such file; or write train:NAME or perturb:10-40deg,0.2") from None
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path}: no readable JSON file of guesses ({error})") from error
     if isinstance(content, dict) and "cam_from_object" in content:
@@ -100,7 +97,5 @@ def _pose(path: Path, rows: Any) -> np.ndarray:
     except (TypeError, ValueError):
         matrix = np.zeros(0)
     if not is_rigid(matrix, _RIGID_TOLERANCE):
-        raise ConfigError(
-            f"{path}: a guess must be a 4x4 cam_from_object by rows: a rotation, a shift, then 0 0 0 1"
-        )
+        raise ConfigError(f"{path}: a guess must be a 4x4 cam_from_object by rows: a rotation, a shift, then 0 0 0 1")
     return nearest_rigid(matrix)

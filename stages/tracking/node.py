@@ -6,14 +6,17 @@ import time
 from collections.abc import Iterable
 from pathlib import Path
 
-from bus.messages import Frame, Message, Pose, Truth
+import numpy as np
+
+from bus.messages import Frame, Message, Pose, Retrieved, Truth
 from bus.node import Output
 from bus.ports import Sequences
-from bus.topics import FRAME, GUESS, POSE, STATE, TRUTH, Topic
+from bus.topics import FRAME, GUESS, POSE, RETRIEVED, STATE, TRUTH, Topic
 from stages.nerf.field import load_field
 from stages.tracking import core
 from stages.tracking.config import TrackingConfig
 from stages.tracking.guesses import make_policy, needs_truth
+from stages.tracking.retrieved import RetrievedPoses
 from stages.tracking.views import training_views
 from stages.tracking.wire import copied, frame_info, outputs_of, pose_result
 
@@ -25,14 +28,16 @@ class TrackingNode:
     outputs: tuple[Topic, ...] = (GUESS, STATE)
 
     def __init__(self, field: Path, config: TrackingConfig) -> None:
-        self.inputs: tuple[Topic, ...] = (FRAME, POSE, TRUTH) if needs_truth(config.guess) else (FRAME, POSE)
+        truth = (TRUTH,) if needs_truth(config.guess) else ()
+        self.inputs: tuple[Topic, ...] = (FRAME, POSE, RETRIEVED, *truth)
         self._field = field
         self._config = config
         self._sequences = Sequences()
 
     def start(self) -> None:
-        views = training_views(load_field(self._field).metadata)
-        self._tracker = core.Tracker(self._config, make_policy(self._config, views))
+        views = training_views(load_field(self._field))
+        self._retrieved = RetrievedPoses()
+        self._tracker = core.Tracker(self._config, make_policy(self._config, views, self._retrieved))
 
     def handle(self, topic: Topic, message: Message) -> Iterable[Output]:
         return outputs_of(self._take_in(message, time.time_ns()))
@@ -51,6 +56,10 @@ class TrackingNode:
             case Truth():
                 truth = copied(message.cam_from_object)
                 return self._tracker.on_truth(message.header.frame_id, truth, now_ns)
+            case Retrieved():
+                poses = np.array(message.cam_from_object)
+                self._retrieved.add(message.header.frame_id, message.header.capture_ns, list(poses))
+                return []
             case Pose():
                 return self._tracker.on_pose(pose_result(message), now_ns)
             case _:

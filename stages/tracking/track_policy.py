@@ -9,23 +9,33 @@ from stages.tracking.config import TrackingConfig
 from stages.tracking.distance import Limit
 from stages.tracking.motion import MotionModel
 from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
+from stages.tracking.retrieved import RetrievedPoses
 from stages.tracking.scoring import score
 from stages.tracking.trust import Trust
 from stages.tracking.views import Keyframes, Relocaliser, TrainingViews
 
 _NEAR_POSES = 4
+_NS_PER_MS = 1e6
 
 
 class TrackPolicy:
     """Guesses from the camera's motion; a pose is believed when it agrees with them, or is found a second time.
 
-    `start` is the pose to begin with; without one the training views are tried. ConfigError if there is neither.
+    `start` is the pose to begin with; without one the training views are tried, those that `retrieved` names first.
+    ConfigError if there is neither.
     """
 
-    def __init__(self, config: TrackingConfig, views: TrainingViews, start: np.ndarray | None = None) -> None:
+    def __init__(
+        self,
+        config: TrackingConfig,
+        views: TrainingViews,
+        start: np.ndarray | None = None,
+        retrieved: RetrievedPoses | None = None,
+    ) -> None:
         scale = self._scale = views.scale
         self._config = config
         self._start = start
+        self._retrieved = retrieved or RetrievedPoses()
         self._settled = Limit(config.settled_deg, config.settled * scale)
         self._far = Limit(config.far_deg, config.far * scale)
         self._motion = MotionModel(config.motion, scale)
@@ -44,7 +54,7 @@ class TrackPolicy:
         """MOTION or KEYFRAME while there is a track, else PRIOR or RELOCALISATION."""
         self._guesses += 1
         if not self._trust.tracked:
-            return self._guess_without_track()
+            return self._guess_without_track(frame)
         predicted, last = self._motion.predict(frame.capture_ns), self._motion.newest
         if self._trust.state is TrackingState.LIMITED and self._guesses % 2 == 0:
             return self._guess(GuessReason.KEYFRAME, self._keyframes.nearest(predicted, otherwise=last))
@@ -83,10 +93,16 @@ class TrackPolicy:
     def _guess(self, reason: GuessReason, cam_from_object: np.ndarray) -> PoseGuess:
         return PoseGuess(reason, cam_from_object, self._trust.epoch)
 
-    def _guess_without_track(self) -> PoseGuess:
+    def _guess_without_track(self, frame: FrameInfo) -> PoseGuess:
         if self._start is not None and self._trust.state is TrackingState.INITIALIZING:
             return self._guess(GuessReason.PRIOR, self._start)
-        return self._guess(GuessReason.RELOCALISATION, self._relocaliser.next())
+        return self._guess(GuessReason.RELOCALISATION, self._search(frame))
+
+    def _search(self, frame: FrameInfo) -> np.ndarray:
+        """A pose to try for a frame of which nothing is known."""
+        photos = self._config.sequence == "photos"
+        within_ns = 0.0 if photos else self._config.motion.horizon_ms * _NS_PER_MS
+        return self._relocaliser.next(self._retrieved.near(frame, within_ns))
 
     def _retry(self, attempt: Attempt) -> PoseGuess | None:
         if attempt.retries >= self._config.retries:
@@ -95,7 +111,7 @@ class TrackPolicy:
         if attempt.retries == 0 and self._trust.tracked:
             nearest = self._keyframes.nearest(guess.cam_from_object, otherwise=self._motion.newest)
             return PoseGuess(GuessReason.KEYFRAME, nearest, guess.epoch)
-        return PoseGuess(GuessReason.RELOCALISATION, self._relocaliser.next(), guess.epoch)
+        return PoseGuess(GuessReason.RELOCALISATION, self._search(attempt.frame), guess.epoch)
 
     def _quality(self, result: PoseResult) -> float:
         return score(result, self._config.score, self._scale)

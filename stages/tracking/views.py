@@ -9,16 +9,20 @@ import numpy as np
 
 from stages.errors import ConfigError
 from stages.nerf.datasets import find_name
-from stages.nerf.metadata import FieldMetadata
+from stages.nerf.field import Field
 from stages.tracking.distance import Limit, centres_of, pairwise
 
 
 @dataclass(frozen=True)
 class TrainingViews:
-    """The views that a field was learnt from: names, and cam_from_object (n, 4, 4)."""
+    """The views that a field was learnt from: names, cam_from_object (n, 4, 4), and how they look, if that is known.
+
+    descriptors: (n, keypoints, 64) int8, as stages.retrieval makes them.
+    """
 
     names: tuple[str, ...]
     cam_from_object: np.ndarray
+    descriptors: np.ndarray | None = None
 
     @property
     def scale(self) -> float:
@@ -36,11 +40,12 @@ class TrainingViews:
         return self.cam_from_object[self.names.index(find_name(list(self.names), name))]
 
 
-def training_views(metadata: FieldMetadata) -> TrainingViews:
-    """The training views that a field file tells of."""
-    poses = [np.reshape(camera.cam_from_object, (4, 4)) for camera in metadata.cameras]
-    names = tuple(camera.name for camera in metadata.cameras)
-    return TrainingViews(names, np.array(poses, dtype=np.float64).reshape(-1, 4, 4))
+def training_views(field: Field) -> TrainingViews:
+    """The training views that a field tells of."""
+    cameras = field.metadata.cameras
+    poses = [np.reshape(camera.cam_from_object, (4, 4)) for camera in cameras]
+    names = tuple(camera.name for camera in cameras)
+    return TrainingViews(names, np.array(poses, dtype=np.float64).reshape(-1, 4, 4), field.descriptors)
 
 
 def farthest_point_order(poses: np.ndarray, limit: Limit) -> list[int]:
@@ -104,6 +109,8 @@ class Keyframes:
 class Relocaliser:
     """Endless guesses while nothing is known: by turns a pose near where the camera was, and a training view.
 
+    Between them come those that retrieval has named, as soon as they are known.
+
     ConfigError if there is no pose at all to try.
     """
 
@@ -112,10 +119,10 @@ class Relocaliser:
         self._far = [views.cam_from_object[i] for i in order]
         self.restart(near)
         self._next_far = 0
+        self._likely: Sequence[np.ndarray] = ()
+        self._next_likely, self._likely_turn = 0, True
         if self.lap == 0:
-            raise ConfigError(
-                "tracking has no pose to begin with: give --guess FILE, or a field with training views"
-            )
+            raise ConfigError("tracking has no pose to begin with: give --guess FILE, or a field with training views")
 
     @property
     def lap(self) -> int:
@@ -132,11 +139,18 @@ class Relocaliser:
         """Try this pose next, once: it was found, but not confirmed."""
         self._pushed = cam_from_object
 
-    def next(self) -> np.ndarray:
-        """The next pose to try."""
+    def next(self, likely: Sequence[np.ndarray] = ()) -> np.ndarray:
+        """The next pose to try. likely: views that look like the frame, best first; the first of them comes at once."""
         if self._pushed is not None:
             pushed, self._pushed = self._pushed, None
             return pushed
+        if likely is not self._likely:
+            self._likely, self._next_likely = likely, 0
+        if self._next_likely < len(likely) and (self._next_likely == 0 or self._likely_turn):
+            self._likely_turn = False
+            self._next_likely += 1
+            return likely[self._next_likely - 1]
+        self._likely_turn = True
         near_turn = bool(self._near) and (self._turn % 2 == 0 or not self._far)
         self._turn += 1
         if near_turn:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,7 +19,10 @@ from deploy.settings import Settings, changed
 from deploy.single import PoseFinder
 from stages.geometry import perturb, rotation_error_deg, translation_error
 from stages.nerf.datasets import load_dataset
-from stages.tracking.views import TrainingViews
+from stages.nerf.field import load_field
+from stages.nerf.loading import make_renderer
+from stages.nerf.rendering_api import RayRenderer, RenderedRays, RenderedView
+from stages.tracking.views import TrainingViews, training_views
 
 NO_VIEWS = TrainingViews((), np.zeros((0, 4, 4)))
 SETTINGS = changed(Settings(), {"matching": {"matcher": "sift"}, "refinement": {"steps": 0}}, "test")
@@ -73,6 +77,64 @@ def test_estimate_on_the_embedded_scene(tmp_path: Path, capsys: pytest.CaptureFi
     assert np.array(found["covariance"]).shape == (6, 6)
     assert cv2.imread(str(picture)).shape == (record.camera.height, record.camera.width, 3)
     assert "points agree" in capsys.readouterr().out
+
+
+def test_without_a_guess_the_pose_is_found_from_a_view_that_looks_alike(tmp_path: Path) -> None:
+    field = demo_file("field.safetensors")
+    record = load_dataset(field.parent, "test").images[7]
+    out = tmp_path / "pose.json"
+    assert main(["estimate", str(field), str(record.path), "--rendering.size", "200", "--json", str(out)]) == 0
+    pose = np.array(json.loads(out.read_text())["cam_from_object"])
+    assert rotation_error_deg(pose, record.cam_from_object) < 1.0
+    assert translation_error(pose, record.cam_from_object) < 0.05
+
+
+def test_nothing_looks_like_a_grey_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    image = tmp_path / "grey.png"
+    cv2.imwrite(str(image), np.full((60, 80, 3), 127, np.uint8))
+    assert main(["estimate", str(demo_file("field.safetensors")), str(image)]) == 1
+    assert "no pose: nothing_alike" in capsys.readouterr().out
+
+
+def test_a_field_that_remembers_nothing_needs_a_guess(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    field = load_field(demo_file("field.safetensors"))
+    field.descriptors = None
+    field.save(tmp_path / "old.safetensors")
+    image = demo_file("field.safetensors").parent / "images" / "test" / "001.jpg"
+    assert main(["estimate", str(tmp_path / "old.safetensors"), str(image)]) == 2
+    assert "give --guess" in capsys.readouterr().err
+
+
+def test_what_was_prepared_is_not_rendered_again() -> None:
+    """The views, their features and their points' consistency are kept; only the frame's is left to do."""
+    path = demo_file("field.safetensors")
+    field, dataset = load_field(path), load_dataset(path.parent, "test", 200)
+    known = training_views(field)
+    views = TrainingViews(known.names[:30:10], known.cam_from_object[:30:10], known.descriptors[:30:10])
+    renderer = Counting(make_renderer(field))
+    one_step = {"tracking": {"passes": 1}, "refinement": {"steps": 0}, "rendering": {"size": 200}}
+    finder = PoseFinder(renderer, changed(Settings(), one_step, "test"), views)
+    finder.prepare(dataset.images[0].camera)
+    assert renderer.views == 3
+    rays = renderer.rays
+    found = [finder.find(dataset.load_rgb(i), dataset.images[i].camera) for i in range(0, len(dataset), 4)]
+    assert any(answer.ok for answer in found)
+    assert (renderer.views, renderer.rays) == (3, rays)
+
+
+class Counting:
+    """A renderer that counts what is asked of it."""
+
+    def __init__(self, renderer: RayRenderer) -> None:
+        self._renderer, self.views, self.rays = renderer, 0, 0
+
+    def render_view(self, *arguments: Any) -> RenderedView:
+        self.views += 1
+        return self._renderer.render_view(*arguments)
+
+    def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
+        self.rays += len(origins)
+        return self._renderer.render_rays(origins, directions)
 
 
 def test_estimate_without_a_pose_exits_with_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

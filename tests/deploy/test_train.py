@@ -9,6 +9,7 @@ import pytest
 from support import posed_images
 
 from deploy.cli import main
+from stages.errors import WeightsError
 from stages.nerf.field import load_field
 
 SMALL = [
@@ -23,7 +24,10 @@ def test_a_field_is_learnt_measured_and_written(tmp_path: Path, capsys: pytest.C
     arguments = ["train", str(tmp_path / "data"), "--out", str(out), "--size", "16", "--training.steps", "3"]
     assert main([*arguments, *SMALL, "--json", str(figures)]) == 0
     written = json.loads(figures.read_text())
-    metadata = load_field(out).metadata
+    field = load_field(out)
+    metadata = field.metadata
+    assert field.descriptors is not None
+    assert field.descriptors.shape == (len(metadata.cameras), 128, 64)
     assert written["steps"] == metadata.trained_steps == 3
     assert len(written["psnr_db_by_view"]) == 3
     assert written["psnr_db"] == pytest.approx(metadata.psnr_db)
@@ -33,6 +37,21 @@ def test_a_field_is_learnt_measured_and_written(tmp_path: Path, capsys: pytest.C
     said = capsys.readouterr()
     assert f"{out}: {written['psnr_db']:.2f} dB on 3 held-out views" in said.out
     assert "training: 0%, step 1, loss" in said.err
+
+
+def test_without_weights_a_field_is_learnt_that_remembers_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def nowhere(*arguments: object) -> Path:
+        raise WeightsError("no weights xfeat.pt: give their path")
+
+    monkeypatch.setattr("stages.matching.xfeat.find_weights", nowhere)
+    posed_images.write_blender(tmp_path / "data", posed_images.centred(32, 32, 40.0))
+    out = tmp_path / "field.safetensors"
+    arguments = ["train", str(tmp_path / "data"), "--out", str(out), "--size", "16", "--training.steps", "1"]
+    assert main([*arguments, *SMALL]) == 0
+    assert load_field(out).descriptors is None
+    assert "no weights xfeat.pt" in capsys.readouterr().err
 
 
 def test_a_bad_place_for_the_field_is_told_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,6 +19,7 @@ from bus.messages import (
     Message,
     Pose,
     Reason,
+    Retrieved,
     State,
     Stats,
     TrackingState,
@@ -90,6 +91,7 @@ def every_message() -> dict[Topic, Message]:
         topics.FRAME: frame(3),
         topics.TRUTH: Truth(header=header, cam_from_object=None),
         topics.GUESS: guess(3),
+        topics.RETRIEVED: Retrieved(**result, cam_from_object=np.stack([np.eye(4)] * 5), similarity=scores(5)),
         topics.VIEW: view(3),
         topics.MATCHES: matches(header),
         topics.CORRESPONDENCES: Correspondences(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,7 +15,7 @@ from stages.errors import FieldFileError
 from stages.geometry import Camera, look_at
 from stages.nerf.config import FieldConfig
 from stages.nerf.field import Field, grid_layout, load_field, new_net
-from stages.nerf.metadata import FieldMetadata, Space
+from stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
 from stages.nerf.occupancy import from_cube, seen_by_cameras
 from stages.nerf.twin import TwinField
 
@@ -74,6 +75,21 @@ def test_wrong_arrays_are_refused(field: Field, tmp_path: Path) -> None:
     field.net.w1[0, 0] = np.nan
     field.save(path)
     assert "w1" in refusal(path)
+
+
+def test_how_the_training_views_look_is_kept_and_checked(field: Field, tmp_path: Path) -> None:
+    camera = TrainingCamera("a", 4, 4, 4.0, 4.0, 1.5, 1.5, (0.0,) * 5, tuple(np.eye(4).ravel().tolist()))
+    field.metadata = msgspec.structs.replace(field.metadata, cameras=[camera, camera])
+    path = tmp_path / "f.safetensors"
+    field.save(path)
+    assert load_field(path).descriptors is None
+    field.descriptors = np.random.default_rng(0).integers(-127, 128, (2, 5, 64), np.int8)
+    field.save(path)
+    np.testing.assert_array_equal(load_field(path).descriptors, field.descriptors)
+    for wrong in (field.descriptors[:1], field.descriptors[..., :32], field.descriptors.astype(np.int16)):
+        field.descriptors = wrong
+        field.save(path)
+        assert "descriptors" in refusal(path)
 
 
 @given(levels=st.integers(1, 8), log2_table=st.integers(4, 14), base=st.integers(2, 20), finest=st.integers(20, 200))

@@ -10,7 +10,15 @@ from bus.messages import Reason
 from stages.errors import ConfigError
 from stages.geometry import Camera, exp_se3, inverse, log_se3, look_at, rotation_error_deg, translation_error
 from stages.pnp.core import PnpConfig, PnpResult, solve
-from stages.pnp.least_squares import normal_equations, reprojection, weighted_lengths
+from stages.pnp.least_squares import (
+    fit_pose,
+    huber_cost,
+    huber_width,
+    normal_equations,
+    reprojection,
+    turned,
+    weighted_lengths,
+)
 
 Maker = Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]
 CAMERA = Camera(400, 300, 420.0, 430.0, 201.0, 147.0)
@@ -208,3 +216,37 @@ def test_the_normal_equations_are_those_of_the_plain_residuals(seed: int, delta:
     pull = (weights * np.minimum(1, delta / plain_lengths))[ahead, None, None] * jacobian[ahead]
     np.testing.assert_allclose(gradient, np.einsum("nki,nk->i", pull, residuals[ahead]), rtol=1e-9)
     np.testing.assert_allclose(hessian, np.einsum("nki,nkj->ij", pull, jacobian[ahead]), rtol=1e-9, atol=1e-9)
+
+
+@given(
+    st.lists(st.floats(-2.0, 2.0), min_size=3, max_size=3),
+    st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3),
+    st.floats(1e-7, 3.0),
+)
+@settings(max_examples=100, deadline=None)
+def test_the_compiled_turn_is_the_exponential(shift: list[float], axis: list[float], angle: float) -> None:
+    direction = np.array(axis) / max(float(np.linalg.norm(axis)), 1e-6)
+    step, out = np.concatenate([shift, angle * direction]), np.empty((4, 4))
+    turned(step, POSE, out)
+    np.testing.assert_allclose(out, exp_se3(step) @ POSE, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_pose_that_is_fitted_is_a_minimum(seed: int) -> None:
+    """At it the loss by the plain residuals has no slope, and no neighbour is better."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (60, 3))
+    pixels = CAMERA.project(points @ POSE[:3, :3].T + POSE[:3, 3]) + rng.normal(0, 1.5, (60, 2))
+    weights = rng.uniform(0.2, 1.0, 60)
+    fit = fit_pose(pixels, points, CAMERA, exp_se3(rng.normal(0, 0.02, 6)) @ POSE, weights, 1e-9)
+    delta = huber_width(np.sqrt(weights) * np.linalg.norm(fit.errors[0], axis=1))
+
+    def loss(step: np.ndarray) -> float:
+        residuals, _ = reprojection(pixels, points, CAMERA, exp_se3(step) @ fit.cam_from_object)
+        return huber_cost(np.sqrt(weights) * np.linalg.norm(residuals, axis=1), delta)
+
+    least = loss(np.zeros(6))
+    assert all(loss(sign * 1e-3 * axis) > least for axis in np.eye(6) for sign in (-1, 1))
+    slopes = np.array([(loss(1e-6 * axis) - loss(-1e-6 * axis)) / 2e-6 for axis in np.eye(6)])
+    curvature = np.array([(loss(1e-3 * axis) + loss(-1e-3 * axis) - 2 * least) / 1e-6 for axis in np.eye(6)])
+    assert (np.abs(slopes / curvature) < 1e-5).all()

@@ -114,4 +114,7 @@ def test_the_cache_forgets_the_longest_unused_views_within_its_bytes(scene: Coun
 def test_a_view_of_nothing_says_so_and_is_never_near_another(scene: Counting) -> None:
     source, away = ViewSource(scene, CONFIG), np.diag([1.0, -1.0, -1.0, 1.0]) @ POSE
     assert source.view(CAMERA, away).visible == 0
-    assert not source.view(CAMERA, away).reused
+    beside = away.copy()
+    beside[0, 3] += 1e-3
+    assert not source.view(CAMERA, beside).reused
+    assert source.view(CAMERA, away).reused

@@ -18,6 +18,7 @@ from stages.tracking.distance import Limit, pairwise
 from stages.tracking.frame_policies import EachFramePolicy, PerturbedTruthPolicy
 from stages.tracking.guesses import make_policy, needs_truth, start_pose
 from stages.tracking.policy import Attempt, FrameInfo, PoseResult
+from stages.tracking.retrieved import RetrievedPoses
 from stages.tracking.track_policy import TrackPolicy
 from stages.tracking.views import Keyframes, Relocaliser, TrainingViews, farthest_point_order, nearest_first
 
@@ -177,6 +178,49 @@ def test_other_views_are_tried_until_a_pose_is_believed() -> None:
     assert all(any((pose == view).all() for view in VIEWS.cam_from_object) for pose in tried)
     there = result(on_sphere(0, 31), attempt.pass_index)
     assert policy.conclude(attempt, there).state is TrackingState.TRACKING
+
+
+def test_views_that_look_like_the_frame_are_tried_before_others() -> None:
+    alike = [on_sphere(170, 40), on_sphere(0, 30), on_sphere(-90, 20)]
+    policy = EachFramePolicy(TrackingConfig(), VIEWS, {7: on_sphere(0, 30)}, lambda frame: alike)
+    prior = policy.first_guess(FRAME)
+    assert prior is not None
+    attempt, tried = Attempt(FRAME, prior, 0), []
+    for _ in range(4):
+        guess = policy.next_guess(attempt, result(None, attempt.pass_index))
+        assert guess is not None
+        tried.append(guess.cam_from_object)
+        attempt = attempt.again(guess, 0)
+    assert tried[0] is alike[0]
+    assert tried[1] is alike[2]
+    distances = [rotation_error_deg(on_sphere(0, 30), pose) for pose in tried[2:]]
+    assert distances == sorted(distances)
+    assert distances[0] < rotation_error_deg(on_sphere(0, 30), alike[0])
+
+
+def test_what_retrieval_has_found_is_kept_by_frame_and_for_a_while() -> None:
+    retrieved, second = RetrievedPoses(), 1_000_000_000
+    for frame_id in range(80):
+        retrieved.add(frame_id, frame_id * second, [on_sphere(frame_id, 0)])
+    assert retrieved.of(FrameInfo(79, 79 * second))[0] == pytest.approx(on_sphere(79, 0))
+    assert retrieved.of(FrameInfo(3, 3 * second)) == ()
+    assert retrieved.of(FrameInfo(79, 78 * second)) == ()
+    just_after = FrameInfo(80, 79 * second + 5)
+    assert retrieved.of(just_after) == ()
+    assert retrieved.near(just_after, within_ns=10.0)[0] == pytest.approx(on_sphere(79, 0))
+    assert retrieved.near(just_after, within_ns=4.0) == ()
+    assert retrieved.near(FrameInfo(50, 50 * second), within_ns=10.0)[0] == pytest.approx(on_sphere(50, 0))
+
+
+def test_relocalisation_begins_with_what_looks_like_the_frame_and_goes_on_elsewhere() -> None:
+    relocaliser, likely = Relocaliser(VIEWS, Limit(40.0, 3.0)), [on_sphere(5, 5), on_sphere(6, 6)]
+    first = relocaliser.next()
+    assert all(first is not pose for pose in likely)
+    tried = [relocaliser.next(likely) for _ in range(5)]
+    assert tried[0] is likely[0]
+    assert tried[2] is likely[1]
+    assert all(pose is not other for pose in likely for other in (tried[1], *tried[3:]))
+    assert relocaliser.next([likely[0]]) is likely[0]
 
 
 def test_searching_ends_and_leaves_no_pose() -> None:

@@ -15,10 +15,22 @@ from PIL import Image
 from support.posed_images import CAMERA, write_blender
 
 from bus.memory import MemoryBus
-from bus.messages import CameraModel, Frame, Guess, GuessReason, Message, Pose, Reason, State, TrackingState, Truth
+from bus.messages import (
+    CameraModel,
+    Frame,
+    Guess,
+    GuessReason,
+    Message,
+    Pose,
+    Reason,
+    Retrieved,
+    State,
+    TrackingState,
+    Truth,
+)
 from bus.node import Handler, Output, first_header, reply_header, run_node
 from bus.ports import Inbox
-from bus.topics import FRAME, GUESS, POSE, STATE, TRUTH, Address, Topic
+from bus.topics import FRAME, GUESS, POSE, RETRIEVED, STATE, TRUTH, Address, Topic
 from stages.camera.config import CameraConfig
 from stages.camera.node import CameraNode
 from stages.errors import ConfigError, FieldFileError
@@ -165,6 +177,27 @@ def test_frames_skipped_by_the_bus_are_counted_at_the_door(scene: Path) -> None:
         guess = next(iter(node.handle(FRAME, frame)))[1]
     state = next(message for topic, message in node.handle(POSE, answer(guess)) if topic is STATE)
     assert (state.admitted, state.dropped_at_the_door) == (2, 2)
+
+
+def test_what_retrieval_names_is_tried_next(scene: Path) -> None:
+    node = TrackingNode(scene / "field", TrackingConfig())
+    node.start()
+    header = first_header(0, 5)
+    model = CameraModel(32, 32, 30.0, 30.0, 15.5, 15.5)
+    frame = Frame(header=header, image=np.zeros((32, 32, 3), np.uint8), encoding="rgb8", camera=model)
+    guess = next(iter(node.handle(FRAME, frame)))[1]
+    assert isinstance(guess, Guess)
+    assert guess.reason is GuessReason.RELOCALISATION
+    named = np.eye(4)
+    named[2, 3] = 7.0
+    retrieved = Retrieved(
+        header=reply_header(guess.header), ok=True, reason=Reason.OK, cam_from_object=named[None],
+        similarity=np.ones(1, np.float32),
+    )  # fmt: skip
+    assert not list(node.handle(RETRIEVED, retrieved))
+    again = next(message for topic, message in node.handle(POSE, answer(guess, ok=False)) if topic is GUESS)
+    assert isinstance(again, Guess)
+    np.testing.assert_array_equal(again.cam_from_object, named)
 
 
 def test_a_pose_that_is_no_rigid_transform_is_a_failure() -> None:

@@ -1,0 +1,33 @@
+"""What is known of the consistency of pixels of views that come again."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+
+import numpy as np
+
+_VIEWS = 128
+
+
+class ConsistencyMemory:
+    """The paper's m of pixels of the last views, by view_id: a pixel is looked at from nearby views only once.
+
+    Keypoints of a view are the same each time that it is matched, so that a view that is used again costs little.
+    """
+
+    def __init__(self, views: int = _VIEWS) -> None:
+        self._capacity = views
+        self._views: OrderedDict[str, dict[int, float]] = OrderedDict()
+
+    def get(self, view_id: str, pixels: np.ndarray, look: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """m (n,) float32 at pixels (n, 2) of a view; `look` gives it for the indices (k,) of those not yet known."""
+        known = self._views.pop(view_id, {})
+        keys = np.ascontiguousarray(pixels, np.float32).view(np.int64)[:, 0].tolist()
+        new = {key: i for i, key in enumerate(keys) if key not in known}
+        if new:
+            known.update(zip(new, look(np.array(list(new.values()))).tolist(), strict=True))
+        self._views[view_id] = known
+        while len(self._views) > self._capacity:
+            self._views.popitem(last=False)
+        return np.array([known[key] for key in keys], np.float32)

@@ -1,0 +1,1 @@
+"""Retrieval: the training views that look most like a frame."""

@@ -132,12 +132,16 @@ def field(path: Path) -> Iterator[Finding]:
     from stages.nerf.field import load_field
 
     try:
-        about = load_field(path).metadata
+        found = load_field(path)
     except StageError as error:
         yield Finding("field", "failed", str(error))
         return
+    about = found.metadata
     quality = "not measured" if about.psnr_db is None else f"{about.psnr_db:.1f} dB"
     yield Finding("field", "ok", f"{path}: {about.dataset_kind}, {len(about.cameras)} training views, {quality}")
+    if found.descriptors is None:
+        told = "it does not remember how its training views look: searches take longer, and estimate needs a guess"
+        yield Finding("field", "note", told, "train it again")
 
 
 def dataset(path: Path) -> Iterator[Finding]:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 BOXES = {
-    "camera": (20, 150), "tracking": (200, 150), "rendering": (340, 30), "matching": (520, 30), "lifting": (700, 30),
-    "pnp": (700, 260), "refinement": (430, 260),
+    "camera": (20, 150), "tracking": (200, 150), "rendering": (360, 30), "matching": (520, 30), "lifting": (700, 30),
+    "pnp": (700, 260), "refinement": (430, 260), "retrieval": (200, 30),
 }  # fmt: skip
 ARROWS = [
     ("camera", "tracking", "frame"), ("tracking", "rendering", "guess"), ("rendering", "matching", "view"),
     ("matching", "lifting", "matches"), ("lifting", "pnp", "correspondences"), ("pnp", "refinement", "estimate"),
-    ("refinement", "tracking", "pose"),
+    ("refinement", "tracking", "pose"), ("camera", "retrieval", "frame"), ("retrieval", "tracking", "retrieved"),
 ]  # fmt: skip
 WIDTH, HEIGHT = 120, 50
 FIELD = {"rendering", "lifting", "refinement"}

@@ -60,19 +60,29 @@ def view_rays(camera: Camera) -> ViewRays:
 
 
 def tile_view(
-    trace: Callable[[np.ndarray, np.ndarray], RenderedRays], space: Space, camera: Camera, cam_from_object: np.ndarray
+    trace: Callable[[np.ndarray, np.ndarray], RenderedRays],
+    space: Space,
+    camera: Camera,
+    cam_from_object: np.ndarray,
+    background: np.ndarray,
+    hit: np.ndarray | slice = slice(None),
 ) -> RenderedView:
-    """Render a view; `trace` takes origins and unit directions in the field's coordinates."""
+    """Render a view; `trace` takes origins and unit directions in the field's coordinates.
+
+    hit: (n,) bool, in the order of view_rays, which rays are traced; the others show the background (3,) in 0..1.
+    """
     bundle = view_rays(camera)
-    origin = (camera_centre(cam_from_object) - space.centre) / space.scale
-    origins = np.empty_like(bundle.unit)
-    origins[:] = origin
-    traced = trace(origins, bundle.unit @ cam_from_object[:3, :3].astype(np.float32))
+    unit, length, order = bundle.unit[hit], bundle.length[hit], bundle.order[hit]
+    origins = np.empty_like(unit)
+    origins[:] = (camera_centre(cam_from_object) - space.centre) / space.scale
+    traced = trace(origins, unit @ cam_from_object[:3, :3].astype(np.float32))
     shape = (camera.height, camera.width)
-    rgb, depth, opacity = np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.float32)
-    rgb.reshape(-1, 3)[bundle.order] = traced.rgb * np.float32(255) + np.float32(0.5)
-    depth.reshape(-1)[bundle.order] = traced.depth * (np.float32(space.scale) / bundle.length)
-    opacity.reshape(-1)[bundle.order] = traced.opacity
+    rgb = np.empty((*shape, 3), np.uint8)
+    rgb[:] = background * np.float32(255) + np.float32(0.5)
+    depth, opacity = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    rgb.reshape(-1, 3)[order] = traced.rgb * np.float32(255) + np.float32(0.5)
+    depth.reshape(-1)[order] = traced.depth * (np.float32(space.scale) / length)
+    opacity.reshape(-1)[order] = traced.opacity
     return RenderedView(rgb, depth, opacity, camera, cam_from_object)
 
 

@@ -86,21 +86,26 @@ class NumbaRenderer:
 
     def render_view(self, camera: Camera, cam_from_object: np.ndarray) -> RenderedView:
         """See RayRenderer."""
-        limits = self._limits(camera, cam_from_object)
-        return tile_view(lambda o, d: self._trace(o, d, limits), self.metadata.space, camera, cam_from_object)
+        tile, limits = view_rays(camera).tile, self._limits(camera, cam_from_object)
+        hit = (limits[:, 1] > limits[:, 0])[tile]
+        near_and_far = limits[tile[hit]]
+        return tile_view(
+            lambda o, d: self._trace(o, d, near_and_far), self.metadata.space, camera, cam_from_object,
+            self._background, hit,
+        )  # fmt: skip
 
     def _limits(self, camera: Camera, cam_from_object: np.ndarray) -> np.ndarray:
-        """Between which distances, in the field's coordinates, a view's rays can meet anything, in their order."""
-        bundle, space = view_rays(camera), self.metadata.space
-        if self._centres is None:
-            return _everywhere(len(bundle.order))
+        """Between which distances, in the field's coordinates, rays of a view's tiles can meet anything: (tiles, 2)."""
+        space = self.metadata.space
         rows, columns = -(-camera.height // TILE), -(-camera.width // TILE)
+        if self._centres is None:
+            return _everywhere(rows * columns)
         limits = np.empty((rows, columns, 2), np.float32)
         origin = (camera_centre(cam_from_object) - space.centre) / space.scale
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         turn = np.ascontiguousarray(cam_from_object[:3, :3])
         tile_limits(self._centres, block_radius(self._domain), turn, origin, intrinsics, TILE, limits)
-        return limits.reshape(-1, 2)[bundle.tile]
+        return limits.reshape(-1, 2)
 
     def close(self) -> None:
         """End the threads."""

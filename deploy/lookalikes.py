@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from deploy.settings import Settings
+from stages.errors import WeightsError
 from stages.geometry import Camera
 from stages.matching.core import PairMatcher
 from stages.rendering.core import view_camera
@@ -16,28 +17,34 @@ class Lookalikes:
     """Finds them by the features that are matched anyway, where these are XFeat's of the right size."""
 
     def __init__(self, views: TrainingViews, settings: Settings, pairs: PairMatcher) -> None:
-        self._poses, self._settings, self._pairs = views.cam_from_object, settings, pairs
+        self._poses, self._size, self._settings, self._pairs = views.cam_from_object, views.size, settings, pairs
         self._retriever: Retriever | None = None
         if views.descriptors is not None and settings.retrieval.candidates > 0:
             self._retriever = Retriever(views.descriptors, settings.retrieval)
         self._describe: Describe | None = None
 
-    def of(self, image: np.ndarray, camera: Camera, image_key: int) -> list[np.ndarray]:
+    def of(self, image: np.ndarray, camera: Camera, image_key: int, needed: bool) -> list[np.ndarray]:
         """cam_from_object of the training views, the most alike first; none if the field does not know how they look.
 
-        Raises WeightsError.
+        Nor are there any without weights; WeightsError is raised for them only where the views are needed.
         """
         if self._retriever is None:
             return []
-        ranking = self._retriever.rank(self._descriptors(image, camera, image_key))
-        return list(self._poses[ranking.index])
+        try:
+            descriptors = self._descriptors(image, camera, image_key)
+        except WeightsError:
+            if needed:
+                raise
+            return []
+        return list(self._poses[self._retriever.rank(descriptors).index])
 
     def _descriptors(self, image: np.ndarray, camera: Camera, image_key: int) -> np.ndarray:
-        small, config = view_camera(camera, self._settings.rendering.longer_side), self._settings.retrieval
-        longer_side = max(small.width, small.height)
-        if self._settings.matching.matcher == "xfeat" and longer_side == config.size:
-            descriptors: np.ndarray = self._pairs.frame_features(image, longer_side, image_key).data.cpu().numpy()
+        matching, small = self._settings.matching, view_camera(camera, self._settings.rendering.longer_side)
+        matched = matching.frame_size or max(small.width, small.height)
+        given = max(image.shape[:2])
+        if matching.matcher == "xfeat" and min(matched, given) == min(self._size, given):
+            descriptors: np.ndarray = self._pairs.frame_features(image, matched, image_key).data.cpu().numpy()
             return descriptors
         if self._describe is None:
-            self._describe = describer(config, self._settings.matching, config.keypoints)
+            self._describe = describer(matching, self._size, self._settings.retrieval.keypoints)
         return self._describe(image)

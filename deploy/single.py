@@ -26,6 +26,7 @@ from stages.tracking.views import TrainingViews
 
 T = TypeVar("T")
 
+_VIEWS_REMEMBERED = 16
 _FRAME = FrameInfo(frame_id=0, capture_ns=0)
 
 
@@ -62,7 +63,7 @@ class PoseFinder:
         self._views = ViewSource(renderer, settings.rendering)
         self._matcher = PairMatcher(build_matcher(settings.matching), settings.matching)
         self._lookalikes = Lookalikes(views, settings, self._matcher)
-        self._consistency = ConsistencyMemory()
+        self._consistency = ConsistencyMemory(max(len(views.names), _VIEWS_REMEMBERED))
         self._images = 0
 
     def prepare(self, camera: Camera) -> None:
@@ -83,11 +84,16 @@ class PoseFinder:
         how they look.
         """
         self._images += 1
-        alike = cache(lambda frame: self._lookalikes.of(image, camera, self._images))
+        clock = _Clock()
+
+        @cache
+        def alike(frame: FrameInfo) -> list[np.ndarray]:
+            return clock.time("retrieval", lambda: self._lookalikes.of(image, camera, self._images, guess is None))
+
         if guess is None:
             likely = alike(_FRAME)
             if not likely:
-                return PoseFound(Reason.NOTHING_ALIKE)
+                return PoseFound(Reason.NOTHING_ALIKE, stage_ms=clock.ms)
             guess = likely[0]
         policy = EachFramePolicy(self._settings.tracking, self._training_views, {_FRAME.frame_id: guess}, alike)
         rng = np.random.default_rng(self._settings.tracking.seed)
@@ -138,7 +144,7 @@ class PoseFinder:
         view = sourced.view
         return lift(
             self._renderer, view.depth, view.opacity, view.camera, view.cam_from_object, pixels, rng,
-            self._settings.lifting, sourced.view_id, self._consistency,
+            self._settings.lifting, self._consistency.of(sourced.view_id),
         )  # fmt: skip
 
 

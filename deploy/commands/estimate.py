@@ -69,6 +69,8 @@ class Options:
             raise UsageError(
                 f"{self.field}: this field does not know how its training views look; give --guess, or train it again"
             )
+        if guess is None and self.settings.retrieval.candidates == 0:
+            raise UsageError("--retrieval.candidates 0 leaves no pose to begin with; give --guess")
         renderer = make_renderer(field, threads=0)
         finder = PoseFinder(renderer, self.settings, views)
         began = time.perf_counter()

@@ -51,7 +51,8 @@ class Options:
     protocol: Literal["nerf-synthetic", "llff", "occluded", "reach"] = "nerf-synthetic"
     method: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """one-step, one-step-unmined, passes and full are the default; also one-step-refined, with -anywhere or -adam,
-    and the published inerf, inerf-2048, pi-nerf, pi-nerf-camera, essential; may be given several times, or all."""
+    retrieved and retrieved-refined (from the training view most like the image, whatever the guess is), and the
+    published inerf, inerf-2048, pi-nerf, pi-nerf-camera, essential; may be given several times, or all."""
     seeds: tuple[int, ...] = (0, 1, 2, 3)
     images: int = 5
     """Held-out images a seed."""
@@ -91,8 +92,8 @@ class Options:
 
         check_writable(self.json, self.plot)
         self._check()
-        names = self._methods()
         field = load_field(self.field)
+        names = self._methods(recalls=field.descriptors is not None)
         renderer = make_renderer(field, threads=0)
         dataset, surface = load_dataset(self.dataset, "test", self.size), self._surface(field, renderer)
         protocol = self._protocol(surface)
@@ -134,14 +135,18 @@ class Options:
         if self.plot is not None and self.plot.suffix != ".png":
             raise UsageError(f"--plot {self.plot}: expected a name that ends with .png")
 
-    def _methods(self) -> Sequence[str]:
+    def _methods(self, recalls: bool) -> Sequence[str]:
+        """Their names. `recalls`: whether the field remembers how its training views look."""
         from deploy.evaluation.methods import DEFAULT, METHODS
 
+        possible = tuple(name for name, method in METHODS.items() if recalls or not method.recalls)
         if "all" in self.method:
-            return tuple(METHODS)
-        unknown = [name for name in self.method if name not in METHODS]
-        if unknown:
-            raise UsageError(f"method {unknown[0]!r}: expected all, or one of {', '.join(METHODS)}")
+            return possible
+        for name in self.method:
+            if name not in METHODS:
+                raise UsageError(f"method {name!r}: expected all, or one of {', '.join(METHODS)}")
+            if name not in possible:
+                raise UsageError(f"method {name!r}: {self.field} does not know how its views look; train it again")
         return tuple(dict.fromkeys(self.method)) or DEFAULT
 
     def _protocol(self, surface: Surface | None) -> Protocol:

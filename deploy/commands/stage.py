@@ -44,7 +44,7 @@ class Options:
     """Where this process listens: the hub for everybody (default: the address of --connect), any other for the
     processes that it exchanges messages with (default: any port, for this machine alone if the hub is on it)."""
     field: Path | None = None
-    """The field, for the processes that need it: tracking, rendering, lifting, refinement."""
+    """The field, for the processes that need it: tracking, retrieval, rendering, lifting, refinement."""
     record: Path | None = None
     """The recorder's file (.mcap)."""
     threads: int | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from deploy.output import check_writable, progress_console, write_json
 from stages.errors import WeightsError
+from stages.matching.core import MatchingConfig
 from stages.nerf.config import FieldConfig, TrainingConfig
 
 if TYPE_CHECKING:
@@ -50,6 +51,8 @@ class Options:
     """Write the figures into this file."""
     training: TrainingConfig = dataclasses.field(default_factory=TrainingConfig)
     model: FieldConfig = dataclasses.field(default_factory=FieldConfig)
+    matching: MatchingConfig = dataclasses.field(default_factory=MatchingConfig)
+    """Where XFeat's weights are, by which the field remembers its training views; nothing else of it is used."""
 
     def run(self) -> int:
         """Train, say how good the field is."""
@@ -60,26 +63,28 @@ class Options:
         holdout = None if self.holdout == "none" else self.holdout
         began = time.monotonic()
         with _progress_bar() as report:
-            trained = train_field(self.dataset, self.out, self.size, holdout, training, self.model, report, _memory())
+            trained = train_field(
+                self.dataset, self.out, self.size, holdout, training, self.model, report, self._remember
+            )
         figures = _figures(trained, self.out)
         write_json(self.json, figures)
         print(f"{self.out}: {_quality(trained)}; {figures['size_bytes'] / 1e6:.1f} MB, ", end="")
         print(f"{figures['steps']} steps in {figures['seconds']:.0f} s, all in {time.monotonic() - began:.0f} s")
         return 0
 
+    def _remember(self, images: Iterable[np.ndarray]) -> np.ndarray | None:
+        """What the field remembers of its training views; None, said on stderr, where the weights are missing."""
+        # Torch takes 300 MB, of which the training has no need.
+        from stages.retrieval.core import describer, remembered
+        from stages.tracking.views import DESCRIBED_SIZE
 
-def _memory() -> Callable[[list[np.ndarray]], np.ndarray] | None:
-    """Makes what the field remembers of its training views; None, said on stderr, where the weights are missing."""
-    from stages.matching.core import MatchingConfig
-    from stages.retrieval.core import RetrievalConfig, describer, remembered
-
-    try:
-        describe = describer(RetrievalConfig(), MatchingConfig())
-    except WeightsError as error:
-        said = f"the field will not remember its training views, for retrieval: {error}"
-        progress_console().print(said, soft_wrap=True)
-        return None
-    return lambda images: remembered([describe(image) for image in images])
+        try:
+            describe = describer(self.matching, DESCRIBED_SIZE)
+        except WeightsError as error:
+            said = f"the field does not remember its training views, for retrieval: {error}"
+            progress_console().print(said, soft_wrap=True)
+            return None
+        return remembered(describe(image) for image in images)
 
 
 def _figures(trained: TrainedField, out: Path) -> dict[str, Any]:

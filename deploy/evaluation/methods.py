@@ -30,26 +30,28 @@ class Method:
     """How to make a finder, and what to expect of it.
 
     slow: takes seconds an image. scale_known: whether its translations mean anything. ablates: the method it is to
-    be compared with, where it is that method with a part left out.
+    be compared with, where it is that method with a part left out. recalls: needs a field that remembers how its
+    training views look.
     """
 
     make: Callable[[RayRenderer, Settings, TrainingViews], Finder]
     slow: bool = False
     scale_known: bool = True
     ablates: str | None = None
+    recalls: bool = False
 
 
-class _FromLookalikes:
-    """Our steps from the training views that look like the image, whatever the guess is; all rendered beforehand."""
+class _FromLookalike:
+    """Our one step from the training view most like the image, whatever the guess is; views are rendered beforehand."""
 
     def __init__(self, finder: PoseFinder) -> None:
         self._finder = finder
-        self._prepared: Camera | None = None
+        self._prepared: set[Camera] = set()
 
     def find(self, image: np.ndarray, camera: Camera, guess: np.ndarray) -> PoseFound:
-        if camera != self._prepared:
+        if camera not in self._prepared:
             self._finder.prepare(camera)
-            self._prepared = camera
+            self._prepared.add(camera)
         return self._finder.find(image, camera)
 
 
@@ -78,9 +80,9 @@ def _retrieved(change: Callable[[Settings], Settings]) -> Method:
         rendering = replace(settings.rendering, cache_mb=_PREPARED_MB)
         matching = replace(settings.matching, kept_views=len(views.names))
         prepared = replace(settings, rendering=rendering, matching=matching)
-        return _FromLookalikes(PoseFinder(renderer, change(prepared), views))
+        return _FromLookalike(PoseFinder(renderer, change(prepared), views))
 
-    return Method(make)
+    return Method(make, recalls=True)
 
 
 def _published(name: str, *, slow: bool = True, scale_known: bool = True, **config: Any) -> Method:
@@ -131,11 +133,11 @@ METHODS: dict[str, Method] = {
     "pi-nerf-camera": _published("pi-nerf", turn_about="camera", loss="mape", angle_deg=15.0, shift=0.3),
 }
 """one-step: a single pass; -unmined: without discarding inconsistent points; -refined: and refinement by colours, on
-pixels around the keypoints or, -anywhere, of the whole image, -adam, by the paper's 40 steps of Adam; passes: up to
-tracking.passes of them, from other guesses where the first leads nowhere; full: those and refinement. essential:
-rotations from matches alone; inerf, -2048: with so many rays a step; pi-nerf, -camera: turned about the camera and
-drawn less widely, closer to its publication; these five are in tests/benchmark/baselines."""
+pixels around the keypoints or, -anywhere, of the whole image, -adam, by the paper's 40 steps of Adam; retrieved,
+-refined: a single pass, without the guess, from the training view most like the image, all of which are rendered
+beforehand; passes: up to tracking.passes of them, from other guesses where the first leads nowhere; full: those and
+refinement. essential: rotations from matches alone; inerf, -2048: with so many rays a step; pi-nerf, -camera: turned
+about the camera and drawn less widely, closer to its publication; these five are in tests/benchmark/baselines."""
 
 _PREPARED_MB = 4096.0
-
 DEFAULT = ("one-step", "one-step-unmined", "passes", "full")

@@ -39,8 +39,9 @@ class Examination:
         method = METHODS[name]
         finder = method.make(self.renderer, settings, self.views)
         pairs = _spread(self.pairs, slow_pairs) if method.slow else self.pairs
-        if not method.slow:  # networks are slow the first time
-            finder.find(*self._question(pairs[-1]))
+        if not method.slow:  # networks are slow the first time, and some prepare for a camera
+            for pair in {self.dataset.images[pair.image].camera: pair for pair in pairs}.values():
+                finder.find(*self._question(pair))
         for pair in track(pairs, description=name, console=progress_console()):
             question = self._question(pair)
             began = time.perf_counter()

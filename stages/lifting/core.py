@@ -13,7 +13,7 @@ import numpy as np
 
 from stages.geometry import Camera, rays
 from stages.lifting.config import LiftingConfig
-from stages.lifting.memory import ConsistencyMemory
+from stages.lifting.memory import ConsistencyMemory, Remember
 from stages.nerf.rendering_api import RayRenderer
 
 __all__ = ["ConsistencyMemory", "Lifted", "LiftingConfig", "consistency", "depth_at", "lift"]
@@ -42,14 +42,13 @@ def lift(
     pixels_in_view: np.ndarray,
     rng: np.random.Generator,
     config: LiftingConfig | None = None,
-    view_id: str = "",
-    memory: ConsistencyMemory | None = None,
+    remember: Remember | None = None,
 ) -> Lifted:
     """Lift pixels (n, 2) of a view and mark the points to keep.
 
     depth (h, w) along the optical axis, opacity (h, w) in 0..1 or uint8, camera and cam_from_object are the view's.
-    `rng` turns the ring of nearby views; the renderer is asked once, for all points and views, or for those alone of
-    which `memory` knows nothing under the view_id.
+    `rng` turns the ring of nearby views; the renderer is asked once, for all points and views, or for those pixels
+    alone that `remember`, for a view that comes again, does not know.
     """
     config = config or LiftingConfig()
     depths = depth_at(depth, pixels_in_view, config.max_depth_step)
@@ -61,7 +60,7 @@ def lift(
     spread = np.full(len(points), _NEVER, np.float32)
     if seen.any():
         look = partial(_look, renderer, points[seen], origins[0], rng, config)
-        spread[seen] = look() if memory is None else memory.get(view_id, pixels_in_view[seen], look)
+        spread[seen] = look() if remember is None else remember(pixels_in_view[seen], look)
     unit = 1.0 if config.gamma_unit == "field" else depths / camera.fx
     displacement = np.where(seen, np.sqrt(spread) / np.maximum(config.gamma * unit, 1e-12), np.inf)
     return Lifted(points, spread, _consistent(displacement, config))

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 _VIEWS = 128
+
+Look = Callable[[np.ndarray], np.ndarray]
+Remember = Callable[[np.ndarray, Look], np.ndarray]
 
 
 class ConsistencyMemory:
@@ -20,8 +24,11 @@ class ConsistencyMemory:
         self._capacity = views
         self._views: OrderedDict[str, dict[int, float]] = OrderedDict()
 
-    def get(self, view_id: str, pixels: np.ndarray, look: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """m (n,) float32 at pixels (n, 2) of a view; `look` gives it for the indices (k,) of those not yet known."""
+    def of(self, view_id: str) -> Remember:
+        """Gives m (n,) float32 at pixels (n, 2) of a view; `look` at the indices (k,) of those that are not known."""
+        return partial(self._get, view_id)
+
+    def _get(self, view_id: str, pixels: np.ndarray, look: Look) -> np.ndarray:
         known = self._views.pop(view_id, {})
         keys = np.ascontiguousarray(pixels, np.float32).view(np.int64)[:, 0].tolist()
         new = {key: i for i, key in enumerate(keys) if key not in known}

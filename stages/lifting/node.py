@@ -37,7 +37,7 @@ class LiftingNode(JoinedHandler):
         guess, header = cast(Guess, joined[GUESS]), reply_header(matches.header)
         lifted = lift(
             self._renderer, view.depth, view.opacity, camera_of(view.camera), np.array(view.cam_from_object),
-            matches.pixels_in_view, frame_rng(header), self._config, view.view_id, self._memory,
+            matches.pixels_in_view, frame_rng(header), self._config, self._memory.of(view.view_id),
         )  # fmt: skip
         ok = bool(lifted.kept.sum() >= self._config.min_kept)
         reason = Reason.OK if ok else Reason.TOO_FEW_CONSISTENT_POINTS

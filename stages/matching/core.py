@@ -50,7 +50,7 @@ class MatchingConfig:
     """side of the patches that place coarse matches between pixels; 0 leaves them where the matcher put them"""
     erode_px: int = 0
     """how far inside the silhouette a pixel of the view must lie to be matched"""
-    kept_views: int = 32
+    kept_views: int = 16
     """features of so many views are kept, for views that come again"""
     weights: Path | None = None
     """file or folder of network weights, in place of an installed package's"""
@@ -156,8 +156,8 @@ class PairMatcher:
         return seen.features
 
     def frame_features(self, frame_image: np.ndarray, longer_side: int, frame_key: Hashable | None = None) -> Features:
-        """The features of a frame (h, w, 3) uint8, shrunk to `longer_side`; kept for a match, as there."""
-        return self._frame(frame_image, self._config.frame_size or longer_side, frame_key).features
+        """The features of a frame (h, w, 3) uint8, shrunk to `longer_side`; kept for a match at that size."""
+        return self._frame(frame_image, longer_side, frame_key).features
 
     def _frame(self, image: np.ndarray, longer_side: int, key: Hashable | None) -> _Seen:
         sized_key = None if key is None else (key, longer_side)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -103,11 +103,11 @@ def train_field(
     training: TrainingConfig | None = None,
     config: FieldConfig | None = None,
     report: Callable[[TrainingReport], None] = lambda _: None,
-    remember: Callable[[list[np.ndarray]], np.ndarray] | None = None,
+    remember: Callable[[Iterable[np.ndarray]], np.ndarray | None] = lambda images: None,
 ) -> TrainedField:
     """Train on a dataset's training images, measure on its held-out ones, and save; Ctrl-C ends the training early.
 
-    remember: makes the field's descriptors of the training images, (h, w, 3) uint8; without it the field has none.
+    remember: makes the field's descriptors of the training images, (h, w, 3) uint8, or None if that cannot be.
     Raises DatasetError; nothing is written before the training is over.
     """
     training, config = training or TrainingConfig(), config or FieldConfig()
@@ -126,13 +126,12 @@ def train_field(
     field = trainer.field(
         replace_metadata(metadata, trained_seconds=time.monotonic() - start, trained_steps=trainer.steps)
     )
-    if remember is not None:
-        field.descriptors = remember([over_background(view.image, dataset.background) for view in views])
-    field.save(out)
+    field.save(out)  # what comes after it takes a while
+    field.descriptors = remember(over_background(view.image, dataset.background) for view in views)
     scores = evaluate(NumbaRenderer(field, training.threads), held_out) if held_out and not interrupted else []
     if scores:
         field.metadata = replace_metadata(field.metadata, psnr_db=float(np.mean(scores)))
-        field.save(out)
+    field.save(out)
     return TrainedField(field, scores, interrupted)
 
 

@@ -136,7 +136,7 @@ def normal_equations(
             hessian[b, a] = hessian[a, b]
 
 
-@njit(nogil=True)
+@njit(nogil=True, cache=True)
 def huber_width(lengths: np.ndarray) -> float:
     """Up to which length of weighted residuals (n,) Huber's loss is quadratic."""
     middle = lengths.shape[0] // 2

@@ -8,7 +8,7 @@ distance from an image's descriptors to their nearest in another.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,8 +56,8 @@ class Retriever:
         return Ranking(index, similarity[index])
 
 
-def describer(config: RetrievalConfig, matching: MatchingConfig, keypoints: int = _REMEMBERED) -> Describe:
-    """Describes images by XFeat, whatever the matcher is. Raises WeightsError."""
+def describer(matching: MatchingConfig, longer_side: int, keypoints: int = _REMEMBERED) -> Describe:
+    """Describes images, no larger than `longer_side`, by XFeat, whatever the matcher is. Raises WeightsError."""
     from stages.matching.xfeat import XFeatExtractor
 
     weights = matching.weights if matching.matcher.startswith("xfeat") else None
@@ -68,20 +68,21 @@ def describer(config: RetrievalConfig, matching: MatchingConfig, keypoints: int 
     )
 
     def describe(image: np.ndarray) -> np.ndarray:
-        features = extractor.extract(shrink(image, config.size)[0])
+        features = extractor.extract(shrink(image, longer_side)[0])
         descriptors: np.ndarray = features.data.cpu().numpy()
         return descriptors
 
     return describe
 
 
-def remembered(descriptors: list[np.ndarray]) -> np.ndarray:
+def remembered(descriptors: Iterable[np.ndarray]) -> np.ndarray:
     """What a field keeps of its training views: of each (n, 64) the first, in (views, keypoints, 64) int8."""
-    kept = np.zeros((len(descriptors), _REMEMBERED, DESCRIPTOR_SIZE), np.int8)
-    for view, described in zip(kept, descriptors, strict=True):
-        strongest = described[:_REMEMBERED]
+    views = []
+    for described in descriptors:
+        strongest, view = described[:_REMEMBERED], np.zeros((_REMEMBERED, DESCRIPTOR_SIZE), np.int8)
         view[: len(strongest)] = np.rint(_UNIT * np.clip(strongest, -1, 1))
-    return kept
+        views.append(view)
+    return np.array(views, np.int8).reshape(-1, _REMEMBERED, DESCRIPTOR_SIZE)
 
 
 def _share_above(cosines: np.ndarray, least: float) -> np.ndarray:

@@ -45,16 +45,16 @@ class RetrievalNode(JoinedHandler):
         if field.descriptors is None or self._config.candidates == 0:
             return
         try:
-            self._describe = describer(self._config, self._matching, self._config.keypoints)
+            self._describe = describer(self._matching, training_views(field).size, self._config.keypoints)
         except WeightsError as error:
             stage_logger(self.name).warning("off", reason=str(error))
             return
-        self._describe(np.zeros((self._config.size, self._config.size, 3), np.uint8))  # the first inference is slow
+        self._describe(np.zeros((64, 64, 3), np.uint8))  # the first inference is slow
         self._poses = training_views(field).cam_from_object
         self._retriever = Retriever(field.descriptors, self._config)
 
     def handle(self, topic: Topic, message: Message) -> Iterator[Output]:
-        if topic is not GUESS or self._wanted(cast(Guess, message)):
+        if self._retriever is not None and (topic is not GUESS or self._wanted(cast(Guess, message))):
             yield from super().handle(topic, message)
 
     def process(self, joined: dict[Topic, Message]) -> Iterable[Output]:
@@ -75,10 +75,9 @@ class RetrievalNode(JoinedHandler):
         )  # fmt: skip
 
     def _wanted(self, guess: Guess) -> bool:
-        """Whether it is a search, for a frame that has not been answered."""
+        """Whether it is a search, and the first for its frame."""
         frame = (guess.header.frame_id, guess.header.capture_ns)
-        wanted = self._retriever is not None and guess.reason is GuessReason.RELOCALISATION
-        if not wanted or frame in self._answered:
-            return False
-        self._answered.append(frame)
-        return True
+        wanted = guess.reason is GuessReason.RELOCALISATION and frame not in self._answered
+        if wanted:
+            self._answered.append(frame)
+        return wanted

@@ -64,8 +64,8 @@ class TrackingConfig:
     """How many other guesses to try on the same frame of a video when one has led nowhere."""
     searches: int = 40
     """How many training views to try, those that look like it first, then those nearest to the guess, for an image
-    that stands by itself and whose pose was not found from its guess; none where there is only one pass. Each costs
-    a pass or more."""
+    that stands by itself and whose pose was not found from its guess; none where there is only one pass and a guess
+    of its own. Each costs a pass or more."""
     seed: int = 0
     """Of the disturbed guesses."""
     max_deadline_ms: float = 10_000.0

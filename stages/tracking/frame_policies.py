@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,10 +22,14 @@ _TRUTHS_KEPT = 256
 
 @dataclass
 class _Trial:
-    """A frame in flight: the poses that have been tried, its guess first, and the newest believed result."""
+    """A frame in flight: the poses that have been tried, its guess first, and the newest believed result.
+
+    near: training views, those nearest to the guess first; None until they are asked for.
+    """
 
     tried: list[np.ndarray]
     found: PoseResult | None = None
+    near: np.ndarray | None = None
 
 
 class EachFramePolicy:
@@ -102,13 +106,21 @@ class EachFramePolicy:
         if len(trial.tried) > self._config.searches:
             return None
         cover = Limit(self._config.cover_deg, self._config.cover * self._scale)
-        poses = self._views.cam_from_object
-        alike, near = self._retrieved(frame), poses[nearest_first(poses, trial.tried[0], cover)]
-        for pose, apart in (*((pose, self._settled) for pose in alike), *((pose, cover) for pose in near)):
-            if not any(apart.holds(pose, tried) for tried in trial.tried):
-                trial.tried.append(pose)
-                return PoseGuess(GuessReason.RELOCALISATION, pose)
-        return None
+        pose = _untried(self._retrieved(frame), trial.tried, self._settled)
+        if pose is None:
+            if trial.near is None:
+                poses = self._views.cam_from_object
+                trial.near = poses[nearest_first(poses, trial.tried[0], cover)]
+            pose = _untried(trial.near, trial.tried, cover)
+        if pose is None:
+            return None
+        trial.tried.append(pose)
+        return PoseGuess(GuessReason.RELOCALISATION, pose)
+
+
+def _untried(poses: Iterable[np.ndarray], tried: Sequence[np.ndarray], apart: Limit) -> np.ndarray | None:
+    """The first pose that lies apart from those tried."""
+    return next((pose for pose in poses if not any(apart.holds(pose, other) for other in tried)), None)
 
 
 @dataclass(frozen=True)

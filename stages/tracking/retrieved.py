@@ -21,7 +21,9 @@ class RetrievedPoses:
         self._poses: OrderedDict[tuple[int, int], Poses] = OrderedDict()
 
     def add(self, frame_id: int, capture_ns: int, poses: Poses) -> None:
-        """Take in what was found for a frame; the longest known is forgotten."""
+        """Take in what was found for a frame, unless that is nothing; the longest known is forgotten."""
+        if not poses:
+            return
         self._poses[frame_id, capture_ns] = poses
         while len(self._poses) > _KEPT:
             self._poses.popitem(last=False)

@@ -105,10 +105,11 @@ class TrackPolicy:
         return self._relocaliser.next(self._retrieved.near(frame, within_ns))
 
     def _retry(self, attempt: Attempt) -> PoseGuess | None:
-        if attempt.retries >= self._config.retries:
+        photos = self._config.sequence == "photos"
+        if attempt.retries >= (self._config.searches if photos else self._config.retries):
             return None
         guess = attempt.guess
-        if attempt.retries == 0 and self._trust.tracked:
+        if attempt.retries == 0 and self._trust.tracked and not photos:
             nearest = self._keyframes.nearest(guess.cam_from_object, otherwise=self._motion.newest)
             return PoseGuess(GuessReason.KEYFRAME, nearest, guess.epoch)
         return PoseGuess(GuessReason.RELOCALISATION, self._search(attempt.frame), guess.epoch)

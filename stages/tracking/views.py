@@ -12,17 +12,21 @@ from stages.nerf.datasets import find_name
 from stages.nerf.field import Field
 from stages.tracking.distance import Limit, centres_of, pairwise
 
+DESCRIBED_SIZE = 400
+"""Longer side to which larger images are shrunk before they are described."""
+
 
 @dataclass(frozen=True)
 class TrainingViews:
     """The views that a field was learnt from: names, cam_from_object (n, 4, 4), and how they look, if that is known.
 
-    descriptors: (n, keypoints, 64) int8, as stages.retrieval makes them.
+    descriptors: (n, keypoints, 64) int8, as stages.retrieval makes them of images whose longer side is `size`.
     """
 
     names: tuple[str, ...]
     cam_from_object: np.ndarray
     descriptors: np.ndarray | None = None
+    size: int = DESCRIBED_SIZE
 
     @property
     def scale(self) -> float:
@@ -45,7 +49,10 @@ def training_views(field: Field) -> TrainingViews:
     cameras = field.metadata.cameras
     poses = [np.reshape(camera.cam_from_object, (4, 4)) for camera in cameras]
     names = tuple(camera.name for camera in cameras)
-    return TrainingViews(names, np.array(poses, dtype=np.float64).reshape(-1, 4, 4), field.descriptors)
+    largest = max((max(camera.width, camera.height) for camera in cameras), default=DESCRIBED_SIZE)
+    return TrainingViews(
+        names, np.array(poses, dtype=np.float64).reshape(-1, 4, 4), field.descriptors, min(largest, DESCRIBED_SIZE)
+    )
 
 
 def farthest_point_order(poses: np.ndarray, limit: Limit) -> list[int]:
@@ -109,7 +116,7 @@ class Keyframes:
 class Relocaliser:
     """Endless guesses while nothing is known: by turns a pose near where the camera was, and a training view.
 
-    Between them come those that retrieval has named, as soon as they are known.
+    Between them come those that retrieval has named; one that is most alike and was not yet tried comes at once.
 
     ConfigError if there is no pose at all to try.
     """
@@ -119,14 +126,12 @@ class Relocaliser:
         self._far = [views.cam_from_object[i] for i in order]
         self.restart(near)
         self._next_far = 0
-        self._likely: Sequence[np.ndarray] = ()
-        self._next_likely, self._likely_turn = 0, True
         if self.lap == 0:
             raise ConfigError("tracking has no pose to begin with: give --guess FILE, or a field with training views")
 
     @property
     def lap(self) -> int:
-        """Guesses until all poses have been tried."""
+        """Guesses until all poses have been tried, without those of retrieval."""
         return len(self._far) + len(self._near)
 
     def restart(self, near: Sequence[np.ndarray]) -> None:
@@ -134,22 +139,25 @@ class Relocaliser:
         self._near = list(near)
         self._pushed: np.ndarray | None = None
         self._turn = self._next_near = 0
+        self._tried: set[bytes] = set()
+        self._likely_turn = True
 
     def push(self, cam_from_object: np.ndarray) -> None:
         """Try this pose next, once: it was found, but not confirmed."""
         self._pushed = cam_from_object
 
     def next(self, likely: Sequence[np.ndarray] = ()) -> np.ndarray:
-        """The next pose to try. likely: views that look like the frame, best first; the first of them comes at once."""
+        """The next pose to try. likely: views that look like the frame, best first."""
         if self._pushed is not None:
             pushed, self._pushed = self._pushed, None
             return pushed
-        if likely is not self._likely:
-            self._likely, self._next_likely = likely, 0
-        if self._next_likely < len(likely) and (self._next_likely == 0 or self._likely_turn):
+        untried = [pose for pose in likely if pose.tobytes() not in self._tried]
+        if untried and (self._likely_turn or untried[0] is likely[0]):
+            self._tried.add(untried[0].tobytes())
             self._likely_turn = False
-            self._next_likely += 1
-            return likely[self._next_likely - 1]
+            return untried[0]
+        if not untried:
+            self._tried.clear()
         self._likely_turn = True
         near_turn = bool(self._near) and (self._turn % 2 == 0 or not self._far)
         self._turn += 1

@@ -22,7 +22,7 @@ def test_each_pixel_of_a_view_is_looked_at_once(questions: list[tuple[str, list[
             looked.update(asked)
             return np.array([ord(view) + n for _, n in asked], np.float32)
 
-        np.testing.assert_array_equal(memory.get(view, pixels, look), [ord(view) + n for n in numbers])
+        np.testing.assert_array_equal(memory.of(view)(pixels, look), [ord(view) + n for n in numbers])
 
 
 def test_the_longest_unused_view_is_forgotten() -> None:
@@ -30,7 +30,7 @@ def test_the_longest_unused_view_is_forgotten() -> None:
     calls: list[str] = []
 
     def ask(view: str) -> None:
-        memory.get(view, pixels, lambda index: calls.append(view) or np.zeros(len(index)))  # type: ignore[func-returns-value]
+        memory.of(view)(pixels, lambda index: calls.append(view) or np.zeros(len(index)))  # type: ignore[func-returns-value]
 
     for view in "abacab":
         ask(view)
@@ -45,7 +45,7 @@ def test_a_view_that_comes_again_is_lifted_alike_without_the_renderer() -> None:
 
     def lifted(renderer: AnalyticScene | None) -> np.ndarray:
         rng = np.random.default_rng(0)
-        found = lift(renderer, view.depth, view.opacity, lens, pose, pixels, rng, config, "view", memory)  # type: ignore[arg-type]
+        found = lift(renderer, view.depth, view.opacity, lens, pose, pixels, rng, config, memory.of("view"))  # type: ignore[arg-type]
         return np.column_stack([found.points_in_object, found.consistency, found.kept])
 
     np.testing.assert_array_equal(lifted(scene), lifted(None))

@@ -60,6 +60,8 @@ def test_a_search_is_answered_once_a_frame_with_training_views(node: RetrievalNo
     assert found.ok
     assert found.header.frame_id == 1
     assert len(found.cam_from_object) == len(found.similarity) == RetrievalConfig().candidates
+    (most,) = asked(started(candidates=256), frame, 1)
+    assert len(most.cam_from_object) == 100
     poses = training_views(load_field(FIELD)).cam_from_object
     assert all((pose == poses).all(axis=(1, 2)).any() for pose in found.cam_from_object)
     assert not asked(node, frame, 1)

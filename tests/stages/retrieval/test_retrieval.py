@@ -62,7 +62,7 @@ def test_nothing_is_like_an_image_without_keypoints() -> None:
     assert 3 not in retriever.rank(described[0]).index
 
 
-@pytest.mark.parametrize("setting", [{"candidates": -1}, {"keypoints": 0}, {"size": 8}])
+@pytest.mark.parametrize("setting", [{"candidates": -1}, {"candidates": 257}, {"keypoints": 0}])
 def test_settings_that_mean_nothing_are_refused(setting: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=next(iter(setting))):
         RetrievalConfig(**setting)  # type: ignore[arg-type]
@@ -74,7 +74,7 @@ def test_photographs_are_recognised_by_what_the_embedded_field_remembers() -> No
     path = demo_file("field.safetensors")
     field, dataset = load_field(path), load_dataset(path.parent, "test", 400)
     assert field.descriptors is not None
-    describe, retriever = describer(RetrievalConfig(), MatchingConfig()), Retriever(field.descriptors)
+    describe, retriever = describer(MatchingConfig(), 400), Retriever(field.descriptors)
     centres = np.array([camera_centre(np.reshape(c.cam_from_object, (4, 4))) for c in field.metadata.cameras])
     for i in range(0, len(dataset), 5):
         first = retriever.rank(describe(dataset.load_rgb(i))).index[0]

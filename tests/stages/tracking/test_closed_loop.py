@@ -136,18 +136,18 @@ def test_a_rough_start_takes_more_passes_and_a_smooth_track_one() -> None:
     assert all(order.pass_index == 0 and order.guess.reason is GuessReason.MOTION for order in later)
 
 
-def test_retries_answer_photos_that_have_no_order() -> None:
+def test_searches_answer_photos_that_have_no_order() -> None:
     azimuths = np.random.default_rng(3).uniform(0, 360, 300)
 
-    def photos(retries: int) -> World:
-        tracker = following(depth=1, sequence="photos", retries=retries)
+    def photos(searches: int) -> World:
+        tracker = following(depth=1, sequence="photos", searches=searches)
         path = lambda t: on_sphere(azimuths[int(t * 30 + 0.5)], 30)  # noqa: E731
         return World(tracker, path, service_ms=10, latency_ms=lambda rng: 10).run(8)
 
-    alone, retried = photos(0), photos(12)
-    assert share(retried.states(1), TRACKING) > 0.9
-    assert share(retried.states(1), TRACKING) > 2 * share(alone.states(1), TRACKING)
-    assert max(retried.worst_error(retried.reports)) < 2.0
+    alone, searched = photos(0), photos(12)
+    assert share(searched.states(1), TRACKING) > 0.9
+    assert share(searched.states(1), TRACKING) > 2 * share(alone.states(1), TRACKING)
+    assert max(searched.worst_error(searched.reports)) < 2.0
 
 
 def test_without_any_pose_to_begin_with_it_says_so() -> None:

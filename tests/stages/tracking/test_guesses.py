@@ -209,18 +209,22 @@ def test_what_retrieval_has_found_is_kept_by_frame_and_for_a_while() -> None:
     assert retrieved.of(just_after) == ()
     assert retrieved.near(just_after, within_ns=10.0)[0] == pytest.approx(on_sphere(79, 0))
     assert retrieved.near(just_after, within_ns=4.0) == ()
+    retrieved.add(80, 79 * second + 5, [])
+    assert retrieved.near(just_after, within_ns=10.0)[0] == pytest.approx(on_sphere(79, 0))
     assert retrieved.near(FrameInfo(50, 50 * second), within_ns=10.0)[0] == pytest.approx(on_sphere(50, 0))
 
 
 def test_relocalisation_begins_with_what_looks_like_the_frame_and_goes_on_elsewhere() -> None:
-    relocaliser, likely = Relocaliser(VIEWS, Limit(40.0, 3.0)), [on_sphere(5, 5), on_sphere(6, 6)]
-    first = relocaliser.next()
-    assert all(first is not pose for pose in likely)
-    tried = [relocaliser.next(likely) for _ in range(5)]
-    assert tried[0] is likely[0]
-    assert tried[2] is likely[1]
-    assert all(pose is not other for pose in likely for other in (tried[1], *tried[3:]))
-    assert relocaliser.next([likely[0]]) is likely[0]
+    relocaliser = Relocaliser(VIEWS, Limit(40.0, 3.0))
+    likely = [on_sphere(5, 5), on_sphere(6, 6), on_sphere(7, 7)]
+
+    def place(pose: np.ndarray) -> int | None:
+        return next((i for i, other in enumerate(likely) if (pose == other).all()), None)
+
+    assert place(relocaliser.next()) is None
+    tried = [place(relocaliser.next([pose.copy() for pose in likely])) for _ in range(8)]
+    assert tried == [0, None, 1, None, 2, None, 0, None]
+    assert place(relocaliser.next([likely[2], likely[0]])) == 2
 
 
 def test_searching_ends_and_leaves_no_pose() -> None:

@@ -47,6 +47,11 @@ class PnpConfig:
     """patches that correlate less are not found"""
     align_px: float = 1.5
     """largest reprojection error of a point that was found, in pixels of the view"""
+    align_spread: float = 0.63
+    """largest root mean square of the errors of what was found, as a share of align_px: points that are found by
+    chance lie anywhere, which makes it 0.71"""
+    min_unaligned: float = 0.3
+    """least share of matches that agree on a pose which no search in the frame bears out, as where that is blurred"""
     min_support: float = 0.15
     """where a smaller share of the points is found in the frame, the matches that agreed may be wrong: others are
     asked for another pose"""

@@ -145,8 +145,8 @@ def _confirmed(
     Where too few do, the matches that agreed so far are left out, for others to agree on another pose. If that
     leads nowhere either, it is the first after all.
     """
-    left, first, most = np.arange(len(points)), None, 0
-    enough, least = (share * len(points) for share in (config.min_support, config.min_inlier_ratio))
+    left, first, most, needed = np.arange(len(points)), None, 0, 0.0
+    enough = config.min_support * len(points)
     fewer = replace(config, min_inlier_ratio=config.min_inlier_ratio * config.unconfirmed_share)
     for _ in range(config.attempts):
         agreed = _agreed(pixels_in_frame[left], points[left], camera, weights[left], fewer)
@@ -158,14 +158,17 @@ def _confirmed(
             found = None
         if found is not None and len(found.index) >= enough:
             return found
-        first, left = first or found or agreed, others
-    return first if first is not None and len(first.index) >= least else None
+        if first is None:
+            first, share = (agreed, config.min_unaligned) if found is None else (found, config.min_inlier_ratio)
+            needed = share * len(points)
+        left = others
+    return first if first is not None and len(first.index) >= needed else None
 
 
 def _aligned(
     agreed: _Consensus, aligner: Aligner, points: np.ndarray, camera: Camera, config: PnpConfig
 ) -> _Consensus | None:
-    """The pose by where the points are found in the frame, from round to round; None where too few are."""
+    """The pose by where the points are found in the frame, from round to round; None where too few are, or by chance."""
     found, rounds = agreed, list(aligner.rounds())
     for i, (level, spread_px) in enumerate(rounds):
         placed = aligner.place(found.fit.cam_from_object, level)
@@ -180,7 +183,8 @@ def _aligned(
         if fit is None:
             return None
         found = _Consensus(fit, placed.index[inliers], placed.pixels[inliers])
-    return found
+    rms = float(np.sqrt((found.fit.errors[0] ** 2).sum(axis=1).mean()))
+    return found if rms <= config.align_spread * rounds[-1][1] else None
 
 
 def _ideal(pixels: np.ndarray, camera: Camera) -> np.ndarray:

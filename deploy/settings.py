@@ -54,9 +54,12 @@ def read_settings(path: Path | None) -> Settings:
 
 def for_video(settings: Settings) -> Settings:
     """The settings with what videos need in place of what was left open."""
-    if settings.rendering.size:
-        return settings
-    return dataclasses.replace(settings, rendering=dataclasses.replace(settings.rendering, size=VIDEO_VIEW_SIZE))
+    rendering, refinement = settings.rendering, settings.refinement
+    if rendering.size == 0:
+        rendering = dataclasses.replace(rendering, size=VIDEO_VIEW_SIZE)
+    if refinement.when == "auto":
+        refinement = dataclasses.replace(refinement, when="never")
+    return dataclasses.replace(settings, rendering=rendering, refinement=refinement)
 
 
 def read_file(path: Path) -> dict[str, Any]:

@@ -61,8 +61,8 @@ class Options:
     """Frames in flight at once (short for --tracking.depth)."""
     matcher: str | None = None
     """xfeat, xfeat-lighterglue, aliked-lightglue, disk-lightglue, loftr or sift (short for --matching.matcher)."""
-    refine: bool = True
-    """Refine poses by colours (--no-refine is short for --refinement.steps 0)."""
+    refine: Literal["auto", "always", "never"] | None = None
+    """Whether to refine poses by colours; auto: not in videos (short for --refinement.when)."""
     listen: str | None = None
     """Address of the hub, for instance tcp/0.0.0.0:7447 (default: a free port of this machine)."""
     logs: Path | None = None
@@ -92,7 +92,7 @@ class Options:
         video = is_video(camera.source)
         if self.sequence != "auto" or not video:
             tracking = replace(tracking, sequence="photos" if self.sequence == "auto" else self.sequence)
-        refinement = s.refinement if self.refine else replace(s.refinement, steps=0)
+        refinement = _with(s.refinement, when=self.refine)
         matching = _with(s.matching, matcher=self.matcher)
         settings = replace(s, camera=camera, tracking=tracking, matching=matching, refinement=refinement)
         return for_video(settings) if tracking.sequence == "video" else settings

@@ -13,6 +13,7 @@ from safetensors.numpy import save_file
 
 from stages.errors import FieldFileError
 from stages.nerf.config import FieldConfig
+from stages.nerf.kernels.space import BLOCK
 from stages.nerf.kernels.types import SH_SIZE, Domain, Net
 from stages.nerf.metadata import FORMAT_VERSION, FieldMetadata, Space
 from stages.nerf.occupancy import pack
@@ -122,8 +123,11 @@ def _assemble(arrays: dict[str, np.ndarray], metadata: FieldMetadata) -> Field:
         expected = getattr(template, name).shape
         if array.shape != expected or not np.all(np.isfinite(array)):
             raise ValueError(f"array {name} has shape {array.shape} or values that are not finite, expected {expected}")
-    n = config.occupancy_resolution
-    occupied = np.unpackbits(arrays["occupied"], bitorder="little", count=n**3).astype(bool).reshape(n, n, n)
+    bits = np.unpackbits(arrays["occupied"], bitorder="little").astype(bool)
+    n = round(len(bits) ** (1 / 3))
+    if n % BLOCK or n**3 != len(bits):
+        raise ValueError(f"array occupied has {len(bits)} bits, expected a cube of cells, in blocks of {BLOCK}")
+    occupied = bits.reshape(n, n, n)
     return Field(metadata, template._replace(**learnt), occupied, _descriptors(arrays, len(metadata.cameras)))
 
 

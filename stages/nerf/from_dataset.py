@@ -17,6 +17,7 @@ from stages.nerf.datasets import Dataset, load_dataset
 from stages.nerf.datasets.images import over_background
 from stages.nerf.field import Field
 from stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
+from stages.nerf.occupancy import finer
 from stages.nerf.raybank import View
 from stages.nerf.renderer import NumbaRenderer
 from stages.nerf.training import Learner, Progress, Trainer, evaluate
@@ -126,6 +127,7 @@ def train_field(
     field = trainer.field(
         replace_metadata(metadata, trained_seconds=time.monotonic() - start, trained_steps=trainer.steps)
     )
+    field.occupied = finer(field.occupied, trainer.densities, metadata.space.step)
     field.save(out)  # what comes after it takes a while
     field.descriptors = remember(over_background(view.image, dataset.background) for view in views)
     scores = evaluate(NumbaRenderer(field, training.threads), held_out) if held_out and not interrupted else []

@@ -168,7 +168,7 @@ def _confirmed(
 def _aligned(
     agreed: _Consensus, aligner: Aligner, points: np.ndarray, camera: Camera, config: PnpConfig
 ) -> _Consensus | None:
-    """The pose by where the points are found in the frame, from round to round; None where too few are, or by chance."""
+    """The pose by where points are found in the frame, from round to round; None where too few are, or by chance."""
     found, rounds = agreed, list(aligner.rounds())
     for i, (level, spread_px) in enumerate(rounds):
         placed = aligner.place(found.fit.cam_from_object, level)

@@ -10,6 +10,8 @@ from typing import Literal
 class RefinementConfig:
     """How a pose is refined by colours (the paper's section III-C)."""
 
+    when: Literal["auto", "always", "never"] = "auto"
+    """auto: not in videos, whose views are so near that the search in the frame leaves it nothing to gain"""
     steps: int = 40
     """at most so many steps; 0 turns refinement off"""
     optimiser: Literal["lm", "adam"] = "lm"
@@ -40,3 +42,8 @@ class RefinementConfig:
     """a step that is smaller, in the same unit, is the last"""
     shared_error: float = 0.8
     """how far neighbouring pixels err together, as a multiple of their differences in colour"""
+
+    @property
+    def on(self) -> bool:
+        """Whether poses are refined at all."""
+        return self.when != "never" and self.steps > 0

@@ -52,7 +52,7 @@ def refine(
     """
     config = config or RefinementConfig()
     unchanged = RefinementResult(cam_from_object, False, None, None, 0)
-    if config.steps == 0:
+    if not config.on:
         return unchanged
     image, camera, keypoints = _shrunk(image, camera, keypoints_in_frame, config.size)
     pixels = rng.permutation(_candidates(keypoints, camera, config))

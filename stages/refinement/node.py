@@ -23,13 +23,13 @@ class RefinementNode(JoinedHandler):
     outputs: tuple[Topic, ...] = (POSE,)
 
     def __init__(self, field: Path, config: RefinementConfig, threads: int = 1) -> None:
-        self.inputs = (ESTIMATE, FRAME) if config.steps > 0 else (ESTIMATE,)
+        self.inputs = (ESTIMATE, FRAME) if config.on else (ESTIMATE,)
         super().__init__()
         self._field, self._config, self._threads = field, config, threads
 
     def start(self) -> None:
         self._renderer = load_renderer(self._field, self._threads)
-        warm_up(self._renderer, jacobian=self._config.steps > 0 and self._config.derivative == "field")
+        warm_up(self._renderer, jacobian=self._config.on and self._config.derivative == "field")
 
     def process(self, joined: dict[Topic, Message]) -> Iterable[Output]:
         estimate, frame = cast(Estimate, joined[ESTIMATE]), cast(Frame | None, joined.get(FRAME))

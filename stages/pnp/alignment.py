@@ -23,8 +23,6 @@ _LOOSER = 1.4
 """Errors before a round are larger than after the last by this and by how coarse the round is."""
 _FLATTEST, _STEEPEST = 0.15, 6.0
 """Patches that cover less or more of the frame than these shares of themselves are seen too differently."""
-_ENOUGH = 300
-"""So many points are enough to come nearer; all of them are looked for at the end."""
 _BASELINE_PX = 2
 _NO_SURFACE = np.float32(1e3)
 _HALF_PX = np.array([[0.0, 0.0], [-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
@@ -58,8 +56,10 @@ class Aligner:
 
     def __init__(self, pictures: Pictures, points: np.ndarray, camera: Camera, config: PnpConfig) -> None:
         self._view_camera, self._view_pose, self._config = pictures.camera, pictures.cam_from_object, config
-        self._view = cv2.cvtColor(pictures.view, cv2.COLOR_RGB2GRAY)
-        self._frame, self._camera = _shrunk(pictures.frame, camera, max(self._view.shape))
+        view = cv2.cvtColor(pictures.view, cv2.COLOR_RGB2GRAY)
+        frame, self._camera = _shrunk(pictures.frame, camera, max(view.shape))
+        levels = range(max(config.align_levels, 1))
+        self._view, self._frame = ([_blurred(grey, level) for level in levels] for grey in (view, frame))
         self._scale = np.array([self._camera.width / camera.width, self._camera.height / camera.height])
         in_view = points @ self._view_pose[:3, :3].T + self._view_pose[:3, 3]
         self._pixels = self._view_camera.project(in_view)
@@ -73,8 +73,8 @@ class Aligner:
             yield level, _LOOSER * finest * 2**level
         yield 0, finest
 
-    def place(self, cam_from_object: np.ndarray, level: int) -> Placed:
-        """Look for the points near where a pose puts them; at a level, patches are 2^level pixels coarse."""
+    def place(self, cam_from_object: np.ndarray, level: int, most: int | None = None) -> Placed:
+        """Look for the points, or `most` of them, near where a pose puts them; patches are 2^level pixels coarse."""
         config, spacing = self._config, float(2**level)
         around, ahead = self._warped(cam_from_object)
         size = (self._camera.width - 1, self._camera.height - 1)
@@ -82,11 +82,11 @@ class Aligner:
         warp = np.stack([around[:, 2] - around[:, 1], around[:, 4] - around[:, 3]], axis=2)
         determinant = np.linalg.det(np.where(seen[:, None, None], warp, 0.0))
         index = np.flatnonzero(seen & (determinant > _FLATTEST) & (determinant < _STEEPEST))
-        if level > 0:
-            index = index[:: -(-len(index) // _ENOUGH) or 1]
+        if most is not None:
+            index = index[:: max(1, -(-len(index) // most))]
         places, similarity = np.empty((len(index), 2), np.float32), np.empty(len(index), np.float32)
         find_patches(
-            _blurred(self._view, level), _blurred(self._frame, level), self._pixels[index].astype(np.float32),
+            self._view[level], self._frame[level], self._pixels[index].astype(np.float32),
             np.linalg.inv(warp[index]).astype(np.float32), around[index, 0].astype(np.float32),
             config.align_half, np.float32(spacing), config.align_steps, places, similarity,
         )  # fmt: skip

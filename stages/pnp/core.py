@@ -22,6 +22,8 @@ __all__ = ["Pictures", "PnpConfig", "PnpResult", "solve", "warm_up"]
 _MIN_POINTS = 4
 _ROUNDS = 3
 _NEAR_ENOUGH = 1e-3
+_ENOUGH = 300
+"""So many points are enough to come nearer; all of them are looked for at the end."""
 _LEAST_ALIGNED = 0.3
 """Of the matches that agreed; where fewer points are found, the frame is blurred, say, and the matches know better."""
 _LEAST_CONFIDENCE = 0.01
@@ -171,14 +173,15 @@ def _aligned(
     """The pose by where points are found in the frame, from round to round; None where too few are, or by chance."""
     found, rounds = agreed, list(aligner.rounds())
     for i, (level, spread_px) in enumerate(rounds):
-        placed = aligner.place(found.fit.cam_from_object, level)
+        last = i == len(rounds) - 1
+        placed = aligner.place(found.fit.cam_from_object, level, None if last else _ENOUGH)
         try:
             pixels, ones = _ideal(placed.pixels, camera), np.ones(len(placed.index))
         except StageError:  # a point was found where the lens has no inverse
             return None
         fit, inliers = _polish(
             pixels, points[placed.index], camera.undistorted(), found.fit.cam_from_object, ones, spread_px, config,
-            CONVERGED if i == len(rounds) - 1 else _NEAR_ENOUGH,
+            CONVERGED if last else _NEAR_ENOUGH,
         )  # fmt: skip
         if fit is None:
             return None

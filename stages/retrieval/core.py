@@ -21,8 +21,10 @@ __all__ = ["Describe", "Ranking", "RetrievalConfig", "Retriever", "describer", "
 
 _REMEMBERED = 128
 _UNIT = 127.0
-_AT_ONCE = 8
-"""Views whose similarities are held at once: few enough for the caches."""
+_AT_ONCE = 1024
+"""Keypoints of views whose similarities are held at once: few enough for the caches."""
+_ROUGH, _LIKELY = 32, 48
+"""So many keypoints of each view tell which views, so many at least, are worth a look at all of theirs."""
 
 Describe = Callable[[np.ndarray], np.ndarray]
 """An image (h, w, 3) uint8 -> its strongest keypoints' unit descriptors (n, 64) float32, the strongest first."""
@@ -42,18 +44,28 @@ class Retriever:
     def __init__(self, descriptors: np.ndarray, config: RetrievalConfig | None = None) -> None:
         self._config = config or RetrievalConfig()
         self._views = np.ascontiguousarray(descriptors, np.float32) / _UNIT
+        self._rough = np.ascontiguousarray(self._views[:, :_ROUGH])
 
     def rank(self, frame: np.ndarray) -> Ranking:
         """The training views that resemble a frame by its descriptors (n, 64), as many as the configuration says."""
-        frame = np.ascontiguousarray(frame[: self._config.keypoints], np.float32)
-        similarity = np.zeros(len(self._views), np.float32)
-        for first in range(0, len(self._views) if len(frame) else 0, _AT_ONCE):
-            some = self._views[first : first + _AT_ONCE]
+        candidates, frame = self._config.candidates, np.ascontiguousarray(frame[: self._config.keypoints], np.float32)
+        if len(frame) == 0:
+            return Ranking(np.zeros(0, np.int64), np.zeros(0, np.float32))
+        likely = _best_first(self._similarity(self._rough, frame))[: max(3 * candidates, _LIKELY)]
+        similarity = self._similarity(self._views[likely], frame)
+        best = _best_first(similarity)[:candidates]
+        best = best[similarity[best] > 0]
+        return Ranking(likely[best], similarity[best])
+
+    def _similarity(self, views: np.ndarray, frame: np.ndarray) -> np.ndarray:
+        """Of views (v, keypoints, 64) to a frame (n, 64): (v,) float32."""
+        similarity = np.empty(len(views), np.float32)
+        at_once = max(1, _AT_ONCE // max(1, views.shape[1]))
+        for first in range(0, len(views), at_once):
+            some = views[first : first + at_once]
             nearest = (frame @ some.reshape(-1, DESCRIPTOR_SIZE).T).max(axis=0).reshape(some.shape[:2])
-            similarity[first : first + _AT_ONCE] = _share_above(nearest, self._config.min_cosine)
-        index = np.argsort(-similarity, kind="stable")[: self._config.candidates]
-        index = index[similarity[index] > 0]
-        return Ranking(index, similarity[index])
+            similarity[first : first + at_once] = _share_above(nearest, self._config.min_cosine)
+        return similarity
 
 
 def describer(matching: MatchingConfig, longer_side: int, keypoints: int = _REMEMBERED) -> Describe:
@@ -83,6 +95,10 @@ def remembered(descriptors: Iterable[np.ndarray]) -> np.ndarray:
         view[: len(strongest)] = np.rint(_UNIT * np.clip(strongest, -1, 1))
         views.append(view)
     return np.array(views, np.int8).reshape(-1, _REMEMBERED, DESCRIPTOR_SIZE)
+
+
+def _best_first(similarity: np.ndarray) -> np.ndarray:
+    return np.argsort(-similarity, kind="stable")
 
 
 def _share_above(cosines: np.ndarray, least: float) -> np.ndarray:

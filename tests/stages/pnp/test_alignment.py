@@ -184,7 +184,7 @@ def test_points_found_where_the_lens_has_no_inverse_leave_the_pose_of_the_matche
     inner = np.linalg.norm(in_frame(points) - 129.5, axis=1) < 60
     pixels = in_frame(points[inner], folding).astype(np.float32)
     corner = Placed(np.arange(20), np.tile([[5.0, 5.0]], (20, 1)))
-    monkeypatch.setattr(Aligner, "place", lambda self, pose, level: corner)
+    monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: corner)
     with pytest.raises(StageError):
         folding.directions(corner.pixels)
     plain = solve(pixels, points[inner], folding)

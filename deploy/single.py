@@ -105,7 +105,8 @@ class PoseFinder:
             further = policy.next_guess(attempt, result)
             if further is not None:
                 attempt = attempt.again(further, now_ns=0)
-        return _concluded(tried, policy.conclude(attempt, result))
+        found = _concluded(tried, policy.conclude(attempt, result))
+        return replace(found, stage_ms={**clock.ms, **found.stage_ms})
 
     def _one_pass(self, image: np.ndarray, camera: Camera, guess: PoseGuess, rng: np.random.Generator) -> PoseFound:
         """One way through the stages."""

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
-from deploy.evaluation.scores import DIMENSIONS, Answer, curve
+from deploy.evaluation.scores import DIMENSIONS, Answer, curve, tells_translations
 
 Answers = Mapping[str, Sequence[Answer]]
 
@@ -26,7 +26,7 @@ def plot_success(answers: Answers, path: Path, title: str) -> None:
     limits = (np.geomspace(0.01, 180, 200), np.geomspace(1e-4, 10, 200))
     for which, (axis, label) in enumerate(zip(axes, ("rotation error, degrees", "translation error"), strict=False)):
         for name, given in answers.items():
-            if which == 0 or all(answer.scale_known for answer in given):
+            if which == 0 or tells_translations(given):
                 axis.semilogx(limits[which], curve(given, which, limits[which]), label=name, **_style(answers, name))
         _framed(axis, label, "share of pairs below")
     _calibration(axes[2], answers)
@@ -42,7 +42,7 @@ def plot_reach(answers: Answers, path: Path, title: str, diameter: float | None)
     drawing, axes = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
     for which, unit in ((0, 1.0), (1, diameter or 1.0)):
         for name, given in answers.items():
-            if all(answer.scale_known for answer in given):
+            if tells_translations(given):
                 middles, shares = _binned([a for a in given if _turned(a) == (which == 0)], which, unit)
                 axes[which].plot(middles, shares, marker="o", markersize=4, label=name, **_style(answers, name))
     _framed(axes[0], "turn of the guess, degrees", "share of right poses")

@@ -67,12 +67,17 @@ class Answer:
         return float(twist @ np.linalg.pinv(self.covariance) @ twist)
 
 
+def tells_translations(answers: Sequence[Answer]) -> bool:
+    """Whether the translations of all answers mean anything."""
+    return all(answer.scale_known for answer in answers)
+
+
 def score(answers: Sequence[Answer], surface: Surface | None = None) -> dict[str, Any]:
     """The scores of one method over its pairs."""
     errors = [answer.errors for answer in answers]
     found = np.array([error for error in errors if error is not None]).reshape(-1, 2)
     close = found < (CLOSE_DEG, CLOSE)
-    count, scale_known = len(answers), all(answer.scale_known for answer in answers)
+    count, scale_known = len(answers), tells_translations(answers)
     distances = [d for answer in answers if (d := answer.mahalanobis_squared) is not None]
     return {
         "pairs": count,
@@ -94,7 +99,7 @@ def share_of_solvable(answers: Sequence[Answer], others: Sequence[Sequence[Answe
 
     None without any such pair, and for a method that cannot tell translations.
     """
-    if not all(answer.scale_known for answer in answers):
+    if not tells_translations(answers):
         return None
     solvable = {id(a.pair) for given in [answers, *others] for a in given if a.right}
     asked = [answer for answer in answers if id(answer.pair) in solvable]
@@ -140,7 +145,7 @@ def difference(first: Sequence[Answer], second: Sequence[Answer]) -> dict[str, A
     given = {id(answer.pair): answer for answer in second}
     asked = [(answer, given[id(answer.pair)]) for answer in first if id(answer.pair) in given]
     both = [(a, b) for a, b in asked if a.errors and b.errors]
-    scale_known = all(answer.scale_known for answer in (*first, *second))
+    scale_known = tells_translations((*first, *second))
     figures: dict[str, Any] = {"pairs": len(asked), "pairs_answered": len(both)}
     for prefix, compared, errors in (("", both, lambda answer: answer.errors), ("capped_", asked, _capped)):
         gaps = np.array([np.subtract(errors(a), errors(b)) for a, b in compared])

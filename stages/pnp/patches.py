@@ -11,7 +11,8 @@ import math
 import numpy as np
 from numba import njit
 
-_FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
+from stages.fastmath import FASTMATH
+
 _LEAST_CONTRAST = np.float32(1e-3)
 _LEAST_TEXTURE = 1e-5
 _CONVERGED = 0.01
@@ -23,7 +24,7 @@ def _inside(x: float, end: float) -> float:
     return min(max(x, np.float32(0)), end)
 
 
-@njit(nogil=True, fastmath=_FASTMATH)
+@njit(nogil=True, fastmath=FASTMATH)
 def _sample(
     image: np.ndarray, width: int, height: int, x: float, y: float, across: np.ndarray, down: np.ndarray,
     out: np.ndarray,
@@ -43,7 +44,7 @@ def _sample(
         out[k] = above_value + v * (below_value - above_value)
 
 
-@njit(nogil=True, fastmath=_FASTMATH)
+@njit(nogil=True, fastmath=FASTMATH)
 def _centred(values: np.ndarray, weight: np.ndarray) -> float:
     """Take the weighted mean from values (k,), and return their weighted power."""
     mean, power = np.float32(0), np.float32(0)
@@ -55,7 +56,7 @@ def _centred(values: np.ndarray, weight: np.ndarray) -> float:
     return power
 
 
-@njit(nogil=True, fastmath=_FASTMATH)
+@njit(nogil=True, fastmath=FASTMATH)
 def _product(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> float:
     total = np.float32(0)
     for k in range(first.shape[0]):
@@ -63,7 +64,7 @@ def _product(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> float
     return total
 
 
-@njit(nogil=True, fastmath=_FASTMATH)
+@njit(nogil=True, fastmath=FASTMATH)
 def _slopes(patch: np.ndarray, side: int, spacing: float, across: np.ndarray, down: np.ndarray) -> None:
     """Derivatives of a flat patch along its rows and columns, one-sided at its ends."""
     for j in range(side):

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.nerf.kernels.types import FASTMATH, Net, Samples
+from stages.fastmath import FASTMATH
+from stages.nerf.kernels.types import Net, Samples
 from stages.nerf.kernels.vectors import BLOCK, WIDTH, blend4, dot4, spread4
 
 PRIME_Y = np.uint32(2654435761)

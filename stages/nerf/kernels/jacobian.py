@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from stages.fastmath import FASTMATH
 from stages.nerf.kernels.backward import (
     colour_backward,
     compact,
@@ -15,7 +16,7 @@ from stages.nerf.kernels.backward import (
 from stages.nerf.kernels.encoding import position_gradients
 from stages.nerf.kernels.packet import forward, shade, surface
 from stages.nerf.kernels.space import cube_gradient
-from stages.nerf.kernels.types import FASTMATH, SH_SIZE, Domain, Net, Rays, Samples
+from stages.nerf.kernels.types import SH_SIZE, Domain, Net, Rays, Samples
 
 
 @njit(nogil=True, fastmath=FASTMATH)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from stages.fastmath import FASTMATH
 from stages.nerf.kernels.march import begin
 from stages.nerf.kernels.packet import shade, surface, trace
 from stages.nerf.kernels.sight import narrow
-from stages.nerf.kernels.types import FASTMATH, Domain, Net, Rays, Samples
+from stages.nerf.kernels.types import Domain, Net, Rays, Samples
 
 
 @njit(nogil=True, fastmath=FASTMATH, cache=True)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from stages.fastmath import FASTMATH
 from stages.nerf.kernels.backward import (
     colour_backward,
     compact,
@@ -16,7 +17,7 @@ from stages.nerf.kernels.backward import (
 )
 from stages.nerf.kernels.encoding import scatter
 from stages.nerf.kernels.packet import forward, shade
-from stages.nerf.kernels.types import FASTMATH, Domain, Net, Rays, Samples
+from stages.nerf.kernels.types import Domain, Net, Rays, Samples
 
 
 class Gradients(NamedTuple):

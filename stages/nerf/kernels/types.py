@@ -6,9 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
-"""What the compiler may assume; NaN and infinity keep their meaning."""
-
 SH_SIZE = 16
 
 

@@ -10,6 +10,7 @@ from bus.messages import GuessReason, TrackingState
 from stages.geometry import rotation_error_deg
 from stages.tracking.config import TrackingConfig
 from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
+from stages.tracking.retrieved import RetrievedPoses
 from stages.tracking.track_policy import TrackPolicy
 
 MS = 1_000_000
@@ -21,7 +22,8 @@ class Camera:
     """Hands frames to a policy every 50 ms, one after another, and the results that a test wants."""
 
     def __init__(self, start: np.ndarray | None = START, **config: object) -> None:
-        self.policy = TrackPolicy(TrackingConfig(**config), VIEWS, start)  # type: ignore[arg-type]
+        self.retrieved = RetrievedPoses()
+        self.policy = TrackPolicy(TrackingConfig(**config), VIEWS, start, self.retrieved)  # type: ignore[arg-type]
         self.frame_id = -1
 
     def attempt(self, skip: int = 0) -> Attempt:
@@ -114,6 +116,42 @@ def test_what_was_under_way_before_a_recovery_is_not_held_against_it() -> None:
     assert camera.conclude(found, found.guess.cam_from_object).state is TrackingState.TRACKING
     assert camera.conclude(stray, None).state is TrackingState.TRACKING
     assert camera.see(None).state is TrackingState.LIMITED
+
+
+def failed(attempt: Attempt) -> PoseResult:
+    return PoseResult(attempt.frame.frame_id, attempt.pass_index, False)
+
+
+def test_a_lost_video_goes_on_from_what_looks_like_its_frames() -> None:
+    camera = tracking()
+    camera.lose()
+    attempt = camera.attempt()
+    alike = on_sphere(77, 20)
+    camera.retrieved.add(attempt.frame.frame_id, attempt.frame.capture_ns, [alike])
+    guess = camera.policy.next_guess(attempt, failed(attempt))
+    assert guess is not None
+    assert guess.reason is GuessReason.RELOCALISATION
+    assert guess.cam_from_object is alike
+    camera.retrieved.add(attempt.frame.frame_id, attempt.frame.capture_ns, [on_sphere(78, 20)])
+    np.testing.assert_array_equal(camera.guess().cam_from_object, on_sphere(78, 20))
+
+
+def test_a_photo_that_the_last_pose_does_not_lead_to_is_searched_for_at_once() -> None:
+    camera = Camera(sequence="photos", searches=3)
+    assert camera.see(START).state is TrackingState.TRACKING
+    attempt, alike = camera.attempt(), [on_sphere(100, 20), on_sphere(130, 20)]
+    tried = []
+    for _ in range(3):
+        guess = camera.policy.next_guess(attempt, failed(attempt))
+        assert guess is not None
+        assert guess.reason is GuessReason.RELOCALISATION
+        tried.append(guess.cam_from_object)
+        camera.retrieved.add(attempt.frame.frame_id, attempt.frame.capture_ns, alike)
+        attempt = attempt.again(guess, 0)
+    assert camera.policy.next_guess(attempt, failed(attempt)) is None
+    assert tried[1] is alike[0]
+    assert tried[2] is not alike[0]
+    assert camera.attempt().guess.reason is GuessReason.KEYFRAME
 
 
 def test_a_loss_is_followed_by_the_last_pose_and_by_training_views() -> None:

@@ -218,7 +218,7 @@ def plot(figures: dict[str, Any], path: Path) -> None:
     """Time of a view by pixels, by samples along a ray and by size of the tables, as a picture."""
     sizes = list(figures["sizes"].values())
     series = (
-        ("pixels", [s["pixels"] for s in sizes], [s["ms_per_view"] for s in sizes]),
+        ("thousand pixels", [s["pixels"] / 1000 for s in sizes], [s["ms_per_view"] for s in sizes]),
         ("samples along a ray (400 pixels)", *_columns(figures["steps"], "samples_per_ray")),
         ("tables, MB (400 pixels)", *_columns(figures["tables"], "mb")),
     )
@@ -226,7 +226,7 @@ def plot(figures: dict[str, Any], path: Path) -> None:
     for axis, (label, x, y) in zip(axes, series, strict=True):
         axis.plot(x, y, "o-")
         axis.set_xlim(left=0)
-        axis.set_ylim(bottom=0)
+        axis.set_ylim(0, 1.1 * max(y))
         axis.set_xlabel(label)
         axis.set_ylabel("ms a view")
         axis.grid(visible=True, alpha=0.3)

@@ -156,6 +156,30 @@ def test_a_frame_without_anything_leaves_the_pose_of_the_matches(
     assert np.array_equal(looked.inliers, plain.inliers)
 
 
+def test_few_matches_that_no_search_bears_out_are_not_believed(view: RenderedView, points: np.ndarray) -> None:
+    """A fifth of the matches agrees, which is enough by itself, but nothing of the view is seen in the frame."""
+    blank, pixels = np.full((260, 260, 3), 128, np.uint8), matched(points, 0.8, 0.5)
+    assert solve(pixels, points, LENS).ok
+    given = pictures(view, blank)
+    assert solve(pixels, points, LENS, pictures=given).reason == "no_consensus"
+    assert solve(pixels, points, LENS, PnpConfig(min_unaligned=0.1), pictures=given).ok
+
+
+@pytest.mark.parametrize(("radius_px", "believed"), [(0.9, True), (2.2, False)])
+def test_points_that_lie_anywhere_where_they_were_looked_for_were_found_by_chance(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray, monkeypatch: pytest.MonkeyPatch, radius_px: float,
+    believed: bool,
+) -> None:  # fmt: skip
+    """Looked for within 1.95 pixels of the frame; where they fill that, the pose is that of the matches after all."""
+    rng, count = np.random.default_rng(1), len(points)
+    angle, radius = rng.uniform(0, 2 * np.pi, count), radius_px * np.sqrt(rng.random(count))
+    scattered = in_frame(points) + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: Placed(np.arange(count), scattered))
+    pixels = matched(points, 0.3, 0.5)
+    plain, looked = solve(pixels, points, LENS), solve(pixels, points, LENS, pictures=pictures(view, frame))
+    assert np.array_equal(pose_of(looked), pose_of(plain)) is not believed
+
+
 def test_a_blurred_frame_is_better_known_by_its_matches(
     view: RenderedView, frame: np.ndarray, points: np.ndarray
 ) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from stages.errors import ConfigError
+
 Backend = Literal["numba", "torch", "cuda"]
 """Compiled kernels on the CPU; torch on the CPU (slow, plain); torch on a CUDA device."""
 
@@ -60,3 +62,10 @@ class TrainingConfig:
     """Threads of the kernels; 0 takes all cores."""
     validation_views: int = 4
     """Held-out views that the progress bar's PSNR is measured on."""
+
+    def __post_init__(self) -> None:
+        if not self.minutes > 0:
+            raise ConfigError(f"training: minutes is {self.minutes:g}, but must be more than 0")
+        if self.steps is not None and self.steps < 1:
+            raise ConfigError(f"training: steps is {self.steps}, but must be at least 1")
+

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
 from stages.errors import FieldFileError
 from stages.nerf.config import FieldConfig
@@ -48,7 +48,8 @@ class Field:
         text = msgspec.json.encode(self.metadata).decode()
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_name(path.name + ".partial")
-        save_file(arrays, partial, metadata={"fieldpose": text, "version": str(FORMAT_VERSION)})
+        # Not save_file, which lets nobody else read what it writes.
+        partial.write_bytes(save(arrays, metadata={"fieldpose": text, "version": str(FORMAT_VERSION)}))
         os.replace(partial, path)
 
 

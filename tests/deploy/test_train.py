@@ -63,6 +63,12 @@ def test_without_weights_a_field_is_learnt_that_remembers_nothing(
     assert "no weights xfeat.pt" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("flags", [["--minutes", "0"], ["--minutes", "-1"], ["--training.steps", "0"]])
+def test_no_time_to_train_in_is_refused(flags: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train", str(tmp_path), "--out", str(tmp_path / "field.safetensors"), *flags]) == 2
+    assert "must be" in capsys.readouterr().err
+
+
 def test_a_bad_place_for_the_field_is_told_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", str(tmp_path / "data"), "--out", str(tmp_path)]) == 2
     assert "is a folder; give the name of a file" in capsys.readouterr().err

@@ -37,6 +37,8 @@ def test_round_trip(field: Field, tmp_path: Path) -> None:
     np.testing.assert_array_equal(back.net.w1, field.net.w1)
     np.testing.assert_allclose(back.net.table, field.net.table, atol=1e-6, rtol=1e-3)
     assert [p.name for p in tmp_path.iterdir()] == ["f.safetensors"]
+    (tmp_path / "other").touch()
+    assert (tmp_path / "f.safetensors").stat().st_mode == (tmp_path / "other").stat().st_mode
 
 
 def refusal(path: Path) -> str:

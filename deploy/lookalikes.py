@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from bus.logs import stage_logger
 from deploy.settings import Settings
 from stages.errors import WeightsError
 from stages.geometry import Camera
@@ -26,15 +27,17 @@ class Lookalikes:
     def of(self, image: np.ndarray, camera: Camera, image_key: int, needed: bool) -> list[np.ndarray]:
         """cam_from_object of the training views, the most alike first; none if the field does not know how they look.
 
-        Nor are there any without weights; WeightsError is raised for them only where the views are needed.
+        Nor are there any without weights: where the views are needed WeightsError is raised, else it is said once.
         """
         if self._retriever is None:
             return []
         try:
             descriptors = self._descriptors(image, camera, image_key)
-        except WeightsError:
+        except WeightsError as error:
             if needed:
                 raise
+            stage_logger("retrieval").warning("off", reason=str(error))
+            self._retriever = None
             return []
         return list(self._poses[self._retriever.rank(descriptors).index])
 

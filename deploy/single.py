@@ -26,7 +26,6 @@ from stages.tracking.views import TrainingViews
 
 T = TypeVar("T")
 
-_VIEWS_REMEMBERED = 16
 _FRAME = FrameInfo(frame_id=0, capture_ns=0)
 
 
@@ -63,7 +62,7 @@ class PoseFinder:
         self._views = ViewSource(renderer, settings.rendering)
         self._matcher = PairMatcher(build_matcher(settings.matching), settings.matching)
         self._lookalikes = Lookalikes(views, settings, self._matcher)
-        self._consistency = ConsistencyMemory(max(len(views.names), _VIEWS_REMEMBERED))
+        self._consistency = ConsistencyMemory(len(views.names))
         self._images = 0
 
     def prepare(self, camera: Camera) -> None:

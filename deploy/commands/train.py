@@ -75,8 +75,8 @@ class Options:
     def _remember(self, images: Iterable[np.ndarray]) -> np.ndarray | None:
         """What the field remembers of its training views; None, said on stderr, where the weights are missing."""
         # Torch takes 300 MB, of which the training has no need.
+        from stages.nerf.field import DESCRIBED_SIZE
         from stages.retrieval.core import describer, remembered
-        from stages.tracking.views import DESCRIBED_SIZE
 
         try:
             describe = describer(self.matching, DESCRIBED_SIZE)

@@ -7,7 +7,6 @@ point is looked at again from nearby views, and discarded where they do not see 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -59,8 +58,12 @@ def lift(
     points = origins + depths[:, None] * directions
     spread = np.full(len(points), _NEVER, np.float32)
     if seen.any():
-        look = partial(_look, renderer, points[seen], origins[0], rng, config)
-        spread[seen] = look() if remember is None else remember(pixels_in_view[seen], look)
+        on_surface = points[seen]
+
+        def look(index: np.ndarray | slice) -> np.ndarray:
+            return consistency(renderer, on_surface[index], origins[0], rng, config)
+
+        spread[seen] = look(slice(None)) if remember is None else remember(pixels_in_view[seen], look)
     unit = 1.0 if config.gamma_unit == "field" else depths / camera.fx
     displacement = np.where(seen, np.sqrt(spread) / np.maximum(config.gamma * unit, 1e-12), np.inf)
     return Lifted(points, spread, _consistent(displacement, config))
@@ -111,13 +114,6 @@ def consistency(
     off = (rendered.depth.reshape(directions.shape[:2]) - 1)[..., None] * directions
     squared = (off**2).sum(axis=2)
     return (np.median if config.statistic == "median" else np.mean)(squared, axis=0).astype(np.float32)
-
-
-def _look(
-    renderer: RayRenderer, points: np.ndarray, camera_centre: np.ndarray, rng: np.random.Generator,
-    config: LiftingConfig, index: np.ndarray | slice = slice(None),
-) -> np.ndarray:  # fmt: skip
-    return consistency(renderer, points[index], camera_centre, rng, config)
 
 
 def _nearby_centres(

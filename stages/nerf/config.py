@@ -68,4 +68,3 @@ class TrainingConfig:
             raise ConfigError(f"training: minutes is {self.minutes:g}, but must be more than 0")
         if self.steps is not None and self.steps < 1:
             raise ConfigError(f"training: steps is {self.steps}, but must be at least 1")
-

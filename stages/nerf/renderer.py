@@ -9,20 +9,21 @@ import numpy as np
 from stages.geometry import Camera, camera_centre
 from stages.nerf.field import Field
 from stages.nerf.kernels.jacobian import render_jacobian
-from stages.nerf.kernels.render import render
+from stages.nerf.kernels.render import render, render_tiles
 from stages.nerf.kernels.sight import block_centres, block_radius, tile_limits
 from stages.nerf.kernels.types import Net
 from stages.nerf.kernels.vectors import WIDTH, reads_half_floats
 from stages.nerf.metadata import FieldMetadata
-from stages.nerf.normalise import TILE, by_object_rays, normalised, tile_view, view_rays
+from stages.nerf.normalise import TILE, by_object_rays, normalised, view_tiles
 from stages.nerf.rendering_api import RenderedRays, RenderedView
 from stages.nerf.workers import Workers
 
-PACKET = 64
+PACKET = TILE * TILE
 PER_RAY = 4
-STOP_BELOW = 5e-3
+STOP_BELOW = 1e-2
 JACOBIAN_STOP_BELOW = 1e-3
 CHUNK = 1024
+_TILES_AT_ONCE = 32
 JACOBIAN_ROWS = 8192
 
 
@@ -86,13 +87,24 @@ class NumbaRenderer:
 
     def render_view(self, camera: Camera, cam_from_object: np.ndarray) -> RenderedView:
         """See RayRenderer."""
-        tile, limits = view_rays(camera).tile, self._limits(camera, cam_from_object)
-        hit = (limits[:, 1] > limits[:, 0])[tile]
-        near_and_far = limits[tile[hit]]
-        return tile_view(
-            lambda o, d: self._trace(o, d, near_and_far), self.metadata.space, camera, cam_from_object,
-            self._background, hit,
+        space, tiles = self.metadata.space, view_tiles(camera)
+        limits = self._limits(camera, cam_from_object)
+        turn = np.ascontiguousarray(cam_from_object[:3, :3], np.float32)
+        origin = ((camera_centre(cam_from_object) - space.centre) / space.scale).astype(np.float32)
+        n, shape = len(tiles.pixel), (camera.height, camera.width)
+        rgb, depth, opacity = np.empty((n, 3), np.uint8), np.empty(n, np.float32), np.empty(n, np.float32)
+        evaluated = self._workers.each(
+            len(limits),
+            _TILES_AT_ONCE,
+            lambda s, a, b: render_tiles(
+                self._net, self._domain, tiles, limits, turn, origin, np.float32(space.scale), self._background, a, b,
+                PER_RAY, self.stop_below, s.samples, s.rays, rgb, depth, opacity,
+            ),
         )  # fmt: skip
+        self.samples_evaluated += sum(evaluated)  # type: ignore[arg-type]
+        return RenderedView(
+            rgb.reshape(*shape, 3), depth.reshape(shape), opacity.reshape(shape), camera, cam_from_object
+        )
 
     def _limits(self, camera: Camera, cam_from_object: np.ndarray) -> np.ndarray:
         """Between which distances, in the field's coordinates, rays of a view's tiles can meet anything: (tiles, 2)."""

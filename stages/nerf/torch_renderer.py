@@ -8,10 +8,10 @@ import numpy as np
 import torch
 
 from stages.errors import ConfigError
-from stages.geometry.cameras import Camera
+from stages.geometry import Camera, rays
 from stages.nerf.config import Backend
 from stages.nerf.field import Field
-from stages.nerf.normalise import by_object_rays, normalised, tile_view
+from stages.nerf.normalise import by_object_rays, normalised
 from stages.nerf.rendering_api import RenderedRays, RenderedView
 from stages.nerf.twin import TwinField, TwinRays, twin_of
 
@@ -24,7 +24,6 @@ class TorchRenderer:
     def __init__(self, field: Field, device: torch.device | str = "cpu"):
         self.metadata = field.metadata
         self._twin: TwinField = twin_of(field, device)
-        self._background = np.array(field.metadata.background, np.float32)
 
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
         """See RayRenderer."""
@@ -61,7 +60,10 @@ class TorchRenderer:
 
     def render_view(self, camera: Camera, cam_from_object: np.ndarray) -> RenderedView:
         """See RayRenderer."""
-        return tile_view(self._trace_all, self.metadata.space, camera, cam_from_object, self._background)
+        traced, shape = self.render_rays(*rays(camera, cam_from_object)), (camera.height, camera.width)
+        rgb = (traced.rgb * np.float32(255) + np.float32(0.5)).astype(np.uint8).reshape(*shape, 3)
+        depth, opacity = traced.depth.reshape(shape), traced.opacity.reshape(shape)
+        return RenderedView(rgb, depth, opacity, camera, cam_from_object)
 
     def _trace(self, o: torch.Tensor, d: torch.Tensor) -> TwinRays:
         jitter = torch.full((len(o),), 0.5, device=o.device)

@@ -1,4 +1,4 @@
-"""Render rays: colour, depth and opacity."""
+"""Render rays, or the tiles of a view: colour, depth and opacity."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from stages.fastmath import FASTMATH
 from stages.nerf.kernels.march import begin
 from stages.nerf.kernels.packet import shade, surface, trace
 from stages.nerf.kernels.sight import narrow
-from stages.nerf.kernels.types import Domain, Net, Rays, Samples
+from stages.nerf.kernels.types import Domain, Net, Rays, Samples, Tiles
 
 
 @njit(nogil=True, fastmath=FASTMATH, cache=True)
@@ -50,4 +50,67 @@ def render(
                 rgb[start + r, c] = shade(rays, r, c, background[c])
             opacity[start + r] = rays.opacity[r]
             depth[start + r] = surface(rays, r)
+    return total
+
+
+@njit(inline="always")
+def level_of(colour: float) -> int:
+    """A colour channel in 0..1 as 0..255."""
+    return np.uint8(min(max(colour, np.float32(0)), np.float32(1)) * np.float32(255) + np.float32(0.5))
+
+
+@njit(nogil=True, fastmath=FASTMATH, cache=True)
+def render_tiles(
+    net: Net,
+    dom: Domain,
+    tiles: Tiles,
+    limits: np.ndarray,
+    turn: np.ndarray,
+    origin: np.ndarray,
+    scale: float,
+    background: np.ndarray,
+    first: int,
+    last: int,
+    per_ray: int,
+    stop_below: float,
+    samples: Samples,
+    rays: Rays,
+    rgb: np.ndarray,
+    depth: np.ndarray,
+    opacity: np.ndarray,
+) -> int:
+    """Fill what tiles first..last show of rgb (pixels, 3) uint8, depth and opacity (pixels,); return the samples used.
+
+    limits (tiles, 2): between which distances a tile's rays are traced, where far <= near not at all.  turn (3, 3)
+    into the camera's axes and origin (3,) of the field's coordinates, whose unit is `scale` of the caller's.  depth is
+    along the optical axis.
+    """
+    size, total = rays.t.shape[0], 0
+    origins, directions = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
+    near_and_far, middle = np.empty((size, 2), np.float32), np.full(size, np.float32(0.5))
+    origins[:] = origin
+    for tile in range(first, last):
+        start, count = tiles.first[tile], tiles.first[tile + 1] - tiles.first[tile]
+        if limits[tile, 1] <= limits[tile, 0]:
+            for r in range(count):
+                pixel = tiles.pixel[start + r]
+                for c in range(3):
+                    rgb[pixel, c] = level_of(background[c])
+                depth[pixel], opacity[pixel] = 0, 0
+            continue
+        for r in range(count):
+            x, y, z = tiles.unit[start + r]
+            for c in range(3):
+                directions[r, c] = x * turn[0, c] + y * turn[1, c] + z * turn[2, c]
+            near_and_far[r] = limits[tile]
+        begin(dom, origins, directions, middle, 0, count, rays)
+        narrow(dom, near_and_far, 0, count, rays)
+        _, evaluated = trace(net, dom, origins, directions, 0, count, per_ray, stop_below, False, samples, rays)
+        total += evaluated
+        for r in range(count):
+            pixel = tiles.pixel[start + r]
+            for c in range(3):
+                rgb[pixel, c] = level_of(shade(rays, r, c, background[c]))
+            depth[pixel] = surface(rays, r) * (scale / tiles.length[start + r])
+            opacity[pixel] = rays.opacity[r]
     return total

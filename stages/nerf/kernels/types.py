@@ -78,3 +78,12 @@ class Rays(NamedTuple):
     drgb: np.ndarray
     dopacity: np.ndarray
     ddepth: np.ndarray
+
+
+class Tiles(NamedTuple):
+    """A camera's rays tile by tile, row by row of tiles, so that rays traced together read the same table entries."""
+
+    first: np.ndarray  # (tiles + 1,) where each tile's rays begin among the n, and their end
+    pixel: np.ndarray  # (n,) row-major pixel index
+    unit: np.ndarray  # (n, 3) direction in the camera
+    length: np.ndarray  # (n,) of the direction with z = 1

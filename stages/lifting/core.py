@@ -108,27 +108,30 @@ def consistency(
     if config.views == 0:
         return np.zeros(len(points), np.float32)
     centres = _nearby_centres(points, camera_centre, rng, config)
-    directions = points[None] - centres
+    directions = points[:, None] - centres
     rendered = renderer.render_rays(centres.reshape(-1, 3), directions.reshape(-1, 3))
     # The point is at parameter 1 of its rays; a ray that meets nothing misses it by its whole distance.
     off = (rendered.depth.reshape(directions.shape[:2]) - 1)[..., None] * directions
     squared = (off**2).sum(axis=2)
-    return (np.median if config.statistic == "median" else np.mean)(squared, axis=0).astype(np.float32)
+    return (np.median if config.statistic == "median" else np.mean)(squared, axis=1).astype(np.float32)
 
 
 def _nearby_centres(
     points: np.ndarray, camera_centre: np.ndarray, rng: np.random.Generator, config: LiftingConfig
 ) -> np.ndarray:
-    """Camera centres (views, n, 3) float32, `angle_deg` around each point (n, 3) from the given centre (3,)."""
+    """Camera centres (n, views, 3) float32, `angle_deg` around each point (n, 3) from the given centre (3,).
+
+    Rays to the same point follow each other, since rays that are traced together read the same table entries.
+    """
     to_camera = (camera_centre - points).astype(np.float64)
     aside = np.eye(3)[np.argmin(np.abs(to_camera), axis=1)]
     first = np.cross(to_camera, aside)
     first *= np.linalg.norm(to_camera, axis=1, keepdims=True) / np.linalg.norm(first, axis=1, keepdims=True)
     second = np.cross(to_camera, first) / np.linalg.norm(to_camera, axis=1, keepdims=True)
     around = rng.uniform(0, 2 * np.pi) + 2 * np.pi * np.arange(config.views) / config.views
-    sideways = np.cos(around)[:, None, None] * first + np.sin(around)[:, None, None] * second
+    sideways = np.cos(around)[:, None] * first[:, None] + np.sin(around)[:, None] * second[:, None]
     angle = np.deg2rad(config.angle_deg)
-    return (points + np.cos(angle) * to_camera + np.sin(angle) * sideways).astype(np.float32)
+    return ((points + np.cos(angle) * to_camera)[:, None] + np.sin(angle) * sideways).astype(np.float32)
 
 
 def _nearest(image: np.ndarray, pixels: np.ndarray) -> np.ndarray:

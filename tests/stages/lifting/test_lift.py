@@ -73,13 +73,13 @@ def test_nearby_views_keep_distance_and_angle() -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (9, 3))
     config = LiftingConfig(views=6, angle_deg=4.0)
     consistency(recorder, points, centre, np.random.default_rng(0), config)
-    before = np.tile(points - centre, (6, 1))
+    before = np.repeat(points - centre, 6, axis=0)
     after = recorder.directions
-    np.testing.assert_allclose(recorder.origins + after, np.tile(points, (6, 1)), atol=1e-5)
+    np.testing.assert_allclose(recorder.origins + after, np.repeat(points, 6, axis=0), atol=1e-5)
     np.testing.assert_allclose(np.linalg.norm(after, axis=1), np.linalg.norm(before, axis=1), rtol=1e-5)
     cosine = (before * after).sum(axis=1) / (np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1))
     np.testing.assert_allclose(np.rad2deg(np.arccos(cosine)), 4.0, atol=0.05)
-    spread = recorder.origins.reshape(6, 9, 3).mean(axis=0)
+    spread = recorder.origins.reshape(9, 6, 3).mean(axis=1)
     opposite = points - np.cos(np.deg2rad(4.0)) * (points - centre)
     np.testing.assert_allclose(spread, opposite, atol=1e-5)
 
@@ -104,7 +104,7 @@ def test_a_point_that_few_views_see_otherwise_is_only_blamed_by_the_mean() -> No
     class Wall:
         def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
             depth = (3.0 - origins[:, 2]) / directions[:, 2]
-            depth[:4] *= 0.5
+            depth[::6] *= 0.5
             return RenderedRays(np.zeros((len(depth), 3), np.float32), depth, np.ones_like(depth))
 
     points = np.array([[0.0, 0.0, 3.0], [0.2, 0.1, 3.0], [-0.3, 0.2, 3.0], [0.1, -0.2, 3.0]])

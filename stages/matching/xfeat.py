@@ -26,7 +26,9 @@ WEIGHTS = WeightsFile(
     ("https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt",),
 )
 _STRIDE = 32
+_MEAN_OF_CHANNELS = np.full((1, 3), 1 / (3 * 255), np.float32)
 _MIN_HEAT = 0.05
+_LEAST_HEAT = 1e-6
 _MIN_COSINE = 0.6
 
 
@@ -54,7 +56,7 @@ class XFeatExtractor:
         return Features(pixels.cpu().numpy(), (width, height), functional.normalize(descriptors, dim=1))
 
     def _padded(self, image: np.ndarray) -> torch.Tensor:
-        grey = torch.from_numpy(np.array(image)).to(self._device).permute(2, 0, 1).float().mean(0)[None, None] / 255
+        grey = torch.from_numpy(cv2.transform(image.astype(np.float32), _MEAN_OF_CHANNELS)).to(self._device)[None, None]
         bottom, right = (-image.shape[0]) % _STRIDE, (-image.shape[1]) % _STRIDE
         return functional.pad(grey, (0, right, 0, bottom), mode="replicate")
 
@@ -62,7 +64,7 @@ class XFeatExtractor:
         """The strongest pixels (x, y) that are maxima of their 5 x 5 neighbourhood."""
         values = heat[0, 0].cpu().numpy()
         peaks = (values == cv2.dilate(values, np.ones((5, 5), np.uint8))) & (values > _MIN_HEAT)
-        y, x = (torch.from_numpy(places).to(heat.device) for places in np.nonzero(peaks))
+        y, x = (torch.from_numpy(places).to(heat.device) for places in np.divmod(np.flatnonzero(peaks), peaks.shape[1]))
         score = heat[0, 0, y, x] * _sample(reliability, x, y, heat.shape, "bilinear")[:, 0]
         best = torch.topk(score, min(self._max_keypoints, len(score))).indices
         return x[best], y[best]
@@ -93,8 +95,7 @@ def mutual_nearest(first: torch.Tensor, second: torch.Tensor) -> tuple[np.ndarra
         return nothing, nothing, torch.zeros(0)
     similarity = first @ second.T
     cosine, forward = similarity.max(1)
-    backward = similarity.argmax(0)
-    mutual = (backward[forward] == torch.arange(len(first), device=first.device)).nonzero()[:, 0]
+    mutual = (cosine >= similarity.amax(0)[forward]).nonzero()[:, 0]
     return mutual.cpu().numpy(), forward[mutual].cpu().numpy(), cosine[mutual].cpu()
 
 
@@ -118,11 +119,11 @@ def _sample(values: torch.Tensor, x: torch.Tensor, y: torch.Tensor, shape: torch
 
 def _peak_offsets(heat: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     """Where the parabola through each peak and its neighbours is highest, per axis: (n, 2), within half a pixel."""
-    logs = torch.log(functional.pad(heat[None, None], (1, 1, 1, 1), mode="replicate")[0, 0].clamp_min(1e-6))
-    x, y = x + 1, y + 1
-    middle = logs[y, x]
-    offsets = []
-    for before, after in ((logs[y, x - 1], logs[y, x + 1]), (logs[y - 1, x], logs[y + 1, x])):
+    height, width = heat.shape
+    middle, offsets = torch.log(heat[y, x].clamp_min(_LEAST_HEAT)), []
+    for dx, dy in ((1, 0), (0, 1)):
+        before = torch.log(heat[(y - dy).clamp_min(0), (x - dx).clamp_min(0)].clamp_min(_LEAST_HEAT))
+        after = torch.log(heat[(y + dy).clamp_max(height - 1), (x + dx).clamp_max(width - 1)].clamp_min(_LEAST_HEAT))
         curvature = (2 * middle - before - after).clamp_min(1e-6)
         offsets.append(((after - before) / (2 * curvature)).clamp(-0.5, 0.5))
     return torch.stack(offsets, 1)

@@ -23,7 +23,7 @@ _REMEMBERED = 128
 _UNIT = 127.0
 _AT_ONCE = 1024
 """Keypoints of views whose similarities are held at once: few enough for the caches."""
-_ROUGH, _LIKELY = 32, 48
+_ROUGH, _LIKELY = 32, 32
 """So many keypoints of each view tell which views, so many at least, are worth a look at all of theirs."""
 
 Describe = Callable[[np.ndarray], np.ndarray]
@@ -51,7 +51,7 @@ class Retriever:
         candidates, frame = self._config.candidates, np.ascontiguousarray(frame[: self._config.keypoints], np.float32)
         if len(frame) == 0:
             return Ranking(np.zeros(0, np.int64), np.zeros(0, np.float32))
-        likely = _best_first(self._similarity(self._rough, frame))[: max(3 * candidates, _LIKELY)]
+        likely = _best_first(self._similarity(self._rough, frame))[: max(2 * candidates, _LIKELY)]
         similarity = self._similarity(self._views[likely], frame)
         best = _best_first(similarity)[:candidates]
         best = best[similarity[best] > 0]

@@ -16,16 +16,15 @@ import numpy as np
 
 from stages.geometry import Camera, inverse
 from stages.pnp.config import PnpConfig
+from stages.pnp.least_squares import intrinsics_of
 from stages.pnp.patches import find_patches
+from stages.pnp.warps import warp_patches
 
-_BLUR = 0.5
+_PER_LEVEL_OF_GREY = np.float32(1 / 255)
 _LOOSER = 1.4
 """Errors before a round are larger than after the last by this and by how coarse the round is."""
-_FLATTEST, _STEEPEST = 0.15, 6.0
-"""Patches that cover less or more of the frame than these shares of themselves are seen too differently."""
 _BASELINE_PX = 2
 _NO_SURFACE = np.float32(1e3)
-_HALF_PX = np.array([[0.0, 0.0], [-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
 
 
 @dataclass(frozen=True)
@@ -58,8 +57,8 @@ class Aligner:
         self._view_camera, self._view_pose, self._config = pictures.camera, pictures.cam_from_object, config
         view = cv2.cvtColor(pictures.view, cv2.COLOR_RGB2GRAY)
         frame, self._camera = _shrunk(pictures.frame, camera, max(view.shape))
-        levels = range(max(config.align_levels, 1))
-        self._view, self._frame = ([_blurred(grey, level) for level in levels] for grey in (view, frame))
+        levels = max(config.align_levels, 1)
+        self._view, self._frame = _pyramid(view, levels), _pyramid(frame, levels)
         self._scale = np.array([self._camera.width / camera.width, self._camera.height / camera.height])
         in_view = points @ self._view_pose[:3, :3].T + self._view_pose[:3, 3]
         self._pixels = self._view_camera.project(in_view)
@@ -69,48 +68,34 @@ class Aligner:
     def rounds(self) -> Iterator[tuple[int, float]]:
         """Level, and largest error that would not surprise, in pixels of the frame, of each round: coarse to fine."""
         finest = self._config.align_px / float(self._scale.min())
-        for level in range(self._config.align_levels - 1, -1, -1):
+        for level in range(self._config.align_levels - 1, 0, -1):
             yield level, _LOOSER * finest * 2**level
         yield 0, finest
 
     def place(self, cam_from_object: np.ndarray, level: int, most: int | None = None) -> Placed:
         """Look for the points, or `most` of them, near where a pose puts them; patches are 2^level pixels coarse."""
-        config, spacing = self._config, float(2**level)
-        around, ahead = self._warped(cam_from_object)
-        size = (self._camera.width - 1, self._camera.height - 1)
-        seen = ahead & ((around[:, 0] >= 0) & (around[:, 0] <= size)).all(axis=1)
-        warp = np.stack([around[:, 2] - around[:, 1], around[:, 4] - around[:, 3]], axis=2)
-        determinant = np.linalg.det(np.where(seen[:, None, None], warp, 0.0))
-        index = np.flatnonzero(seen & (determinant > _FLATTEST) & (determinant < _STEEPEST))
+        config, smaller = self._config, np.float32(0.5**level)
+        width, height, count = self._camera.width, self._camera.height, len(self._pixels)
+        starts, warps = np.empty((count, 2), np.float32), np.empty((count, 2, 2), np.float32)
+        seen = np.empty(count, bool)
+        warp_patches(
+            self._pixels, self._inverse_depth, self._slopes, intrinsics_of(self._view_camera),
+            cam_from_object @ inverse(self._view_pose), intrinsics_of(self._camera),
+            np.array(self._camera.distortion), (width, height), starts, warps, seen,
+        )  # fmt: skip
+        index = np.flatnonzero(seen)
         if most is not None:
             index = index[:: max(1, -(-len(index) // most))]
         places, similarity = np.empty((len(index), 2), np.float32), np.empty(len(index), np.float32)
         find_patches(
-            self._view[level], self._frame[level], self._pixels[index].astype(np.float32),
-            np.linalg.inv(warp[index]).astype(np.float32), around[index, 0].astype(np.float32),
-            config.align_half, np.float32(spacing), config.align_steps, places, similarity,
+            self._view[level], self._frame[level], (self._pixels[index] * smaller).astype(np.float32), warps[index],
+            starts[index] * smaller, config.align_half, config.align_steps, places, similarity,
         )  # fmt: skip
-        inside = ((places >= 0) & (places <= size)).all(axis=1)
+        places /= smaller
+        inside = ((places >= 0) & (places <= (width - 1, height - 1))).all(axis=1)
         found = inside & (similarity > config.align_similarity)
         pixels = (places[found].astype(np.float64) + 0.5) / self._scale - 0.5
         return Placed(index[found], pixels)
-
-    def _warped(self, cam_from_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where the points, and pixels of the view half a pixel left, right, above and below, are: (n, 5, 2).
-
-        And which points (n,) are ahead of the camera. The surface around a point is taken to be its tangent plane.
-        """
-        in_view = self._pixels[:, None] + _HALF_PX
-        inverse_depth = self._inverse_depth[:, None] + self._slopes @ _HALF_PX.T
-        camera = self._view_camera
-        ideal = (in_view - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
-        rays = np.concatenate([ideal, np.ones_like(ideal[..., :1])], axis=2)
-        frame_from_view = cam_from_object @ inverse(self._view_pose)
-        # A plane's inverse depth is linear in the pixel; points are scaled by it, which projects to the same pixels.
-        scaled = rays @ frame_from_view[:3, :3].T + inverse_depth[..., None] * frame_from_view[:3, 3]
-        ahead = np.isfinite(scaled).all(axis=(1, 2)) & (scaled[..., 2] > 1e-6).all(axis=1)
-        scaled[~ahead] = (0.0, 0.0, 1.0)
-        return self._camera.project(scaled.reshape(-1, 3)).reshape(-1, 5, 2), ahead
 
 
 def inverse_depth_slopes(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -148,6 +133,9 @@ def _shrunk(image: np.ndarray, camera: Camera, longer_side: int) -> tuple[np.nda
     return cv2.resize(grey, (small.width, small.height), interpolation=cv2.INTER_AREA), small
 
 
-def _blurred(grey: np.ndarray, level: int) -> np.ndarray:
-    values = grey.astype(np.float32) / 255
-    return values if level == 0 else cv2.GaussianBlur(values, (0, 0), _BLUR * 2**level)
+def _pyramid(grey: np.ndarray, levels: int) -> list[np.ndarray]:
+    """The image as float32 in 0..1, then each half as large as the one before, whose pixel 2 x is its pixel x."""
+    images: list[np.ndarray] = [grey.astype(np.float32) * _PER_LEVEL_OF_GREY]
+    while len(images) < levels:
+        images.append(cv2.pyrDown(images[-1]))
+    return images

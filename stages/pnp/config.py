@@ -15,9 +15,9 @@ class PnpConfig:
     """largest reprojection error of an inlier where the image is 400 pixels long; it grows with the image"""
     iterations: int = 5000
     """at most so many samples of three points"""
-    confidence: float = 0.99999
+    confidence: float = 0.9999
     """RANSAC stops when a better pose would have been seen with this probability"""
-    least_iterations: int = 100
+    least_iterations: int = 50
     """at least so many"""
     min_inliers: int = 8
     """fewer inliers are no pose"""

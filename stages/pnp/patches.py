@@ -15,8 +15,9 @@ from stages.fastmath import FASTMATH
 
 _LEAST_CONTRAST = np.float32(1e-3)
 _LEAST_TEXTURE = 1e-5
-_CONVERGED = 0.01
-_FARTHEST = 3.0
+_CONVERGED = np.float32(0.01)
+_LONGEST_STEP = np.float32(1)
+_FARTHEST = np.float32(3)
 
 
 @njit(inline="always")
@@ -65,18 +66,18 @@ def _product(first: np.ndarray, second: np.ndarray, weight: np.ndarray) -> float
 
 
 @njit(nogil=True, fastmath=FASTMATH)
-def _slopes(patch: np.ndarray, side: int, spacing: float, across: np.ndarray, down: np.ndarray) -> None:
+def _slopes(patch: np.ndarray, side: int, across: np.ndarray, down: np.ndarray) -> None:
     """Derivatives of a flat patch along its rows and columns, one-sided at its ends."""
     for j in range(side):
         above, under = max(j - 1, 0), min(j + 1, side - 1)
         for i in range(side):
             left, right = max(i - 1, 0), min(i + 1, side - 1)
-            across[j * side + i] = (patch[j * side + right] - patch[j * side + left]) / (spacing * (right - left))
-            down[j * side + i] = (patch[under * side + i] - patch[above * side + i]) / (spacing * (under - above))
+            across[j * side + i] = (patch[j * side + right] - patch[j * side + left]) / np.float32(right - left)
+            down[j * side + i] = (patch[under * side + i] - patch[above * side + i]) / np.float32(under - above)
 
 
 @njit(nogil=True)
-def _window(half: int, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _window(half: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Offsets across and down of a patch's samples, row by row, and their weights, which add up to 1."""
     side = 2 * half + 1
     count = side * side
@@ -84,7 +85,7 @@ def _window(half: int, spacing: float) -> tuple[np.ndarray, np.ndarray, np.ndarr
     weight, total = np.empty(count, np.float32), np.float32(0)
     for k in range(count):
         dx, dy = k % side - half, k // side - half
-        x_offset[k], y_offset[k] = spacing * dx, spacing * dy
+        x_offset[k], y_offset[k] = dx, dy
         weight[k] = math.exp(-(dx * dx + dy * dy) / (2 * (0.6 * half) ** 2))
         total += weight[k]
     for k in range(count):
@@ -100,7 +101,6 @@ def find_patches(
     first_from_second: np.ndarray,
     starts: np.ndarray,
     half: int,
-    spacing: float,
     steps: int,
     places: np.ndarray,
     similarity: np.ndarray,
@@ -109,16 +109,16 @@ def find_patches(
 
     first, second: (h, w) float32.  centres (n, 2): pixels of the first, starts (n, 2): about where they are in the
     second.  first_from_second (n, 2, 2): how offsets from the one become offsets from the other.  A patch has
-    2 half + 1 samples a side, `spacing` pixels of the second apart.  similarity: normalised correlation, weighted
-    towards the middle, -1 to 1; -1 where the patch is too plain to be placed or the search leads away by three
-    spacings or more (the place is then the start). All float32.
+    2 half + 1 samples a side, a pixel of the second apart.  similarity: normalised correlation, weighted towards the
+    middle, -1 to 1; -1 where the patch is too plain to be placed or the search leads away by three pixels or more
+    (the place is then the start). All float32.
     """
     if min(first.shape[0], first.shape[1], second.shape[0], second.shape[1]) < 2:
         places[:], similarity[:] = starts, -1
         return
     side = 2 * half + 1
     count = side * side
-    x_offset, y_offset, weight = _window(half, spacing)
+    x_offset, y_offset, weight = _window(half)
     patch, other = np.empty(count, np.float32), np.empty(count, np.float32)
     warped_x, warped_y = np.empty(count, np.float32), np.empty(count, np.float32)
     across, down = np.empty(count, np.float32), np.empty(count, np.float32)
@@ -132,11 +132,11 @@ def find_patches(
             warped_y[k] = c * x_offset[k] + d * y_offset[k]
         _sample(flat, first.shape[1], first.shape[0], centres[i, 0], centres[i, 1], warped_x, warped_y, patch)
         contrast = math.sqrt(_centred(patch, weight))
-        _slopes(patch, side, spacing, across, down)
+        _slopes(patch, side, across, down)
         xx, yy = _centred(across, weight), _centred(down, weight)
         xy = _product(across, down, weight)
         weakest = (xx + yy) / 2 - math.sqrt((xx - yy) * (xx - yy) / 4 + xy * xy)
-        if not weakest * spacing * spacing > _LEAST_TEXTURE:
+        if not weakest > _LEAST_TEXTURE:
             continue
         determinant = xx * yy - xy * xy
         x, y = starts[i]
@@ -150,10 +150,10 @@ def find_patches(
             pull_x, pull_y = _product(across, other, weight), _product(down, other, weight)
             shift_x = (yy * pull_x - xy * pull_y) / determinant
             shift_y = (xx * pull_y - xy * pull_x) / determinant
-            x -= min(max(shift_x, -spacing), spacing)
-            y -= min(max(shift_y, -spacing), spacing)
-            if shift_x * shift_x + shift_y * shift_y < (_CONVERGED * spacing) ** 2:
+            x -= min(max(shift_x, -_LONGEST_STEP), _LONGEST_STEP)
+            y -= min(max(shift_y, -_LONGEST_STEP), _LONGEST_STEP)
+            if shift_x * shift_x + shift_y * shift_y < _CONVERGED**2:
                 break
-        if (x - starts[i, 0]) ** 2 + (y - starts[i, 1]) ** 2 < (_FARTHEST * spacing) ** 2:
+        if (x - starts[i, 0]) ** 2 + (y - starts[i, 1]) ** 2 < _FARTHEST**2:
             places[i, 0], places[i, 1] = x, y
             similarity[i] = alike

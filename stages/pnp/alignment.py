@@ -68,7 +68,7 @@ class Aligner:
     def rounds(self) -> Iterator[tuple[int, float]]:
         """Level, and largest error that would not surprise, in pixels of the frame, of each round: coarse to fine."""
         finest = self._config.align_px / float(self._scale.min())
-        for level in range(self._config.align_levels - 1, 0, -1):
+        for level in range(self._config.align_levels - 1, -1, -1):
             yield level, _LOOSER * finest * 2**level
         yield 0, finest
 

@@ -2,9 +2,9 @@
 
 Zenoh tells of its own tokens by way of the hub too, before two peers have a link, so what is sent on seeing one can be
 lost; and one in fifty that were declared while a link came up was never seen at all (1.10.2). Here each session says
-which tokens it holds when that changes and when it is greeted, and it is greeted when a link to it comes up. So who
-knows of a token knows the subscriptions behind it too. A token ends with the link to its holder: at once where that
-process is killed, after the lease where its host is gone.
+which tokens it holds when that changes and when it is greeted. Whenever a link comes up or what it holds changes it
+greets too, until it is answered, for a word may be lost. So who knows of a token knows the subscriptions behind it. A
+token ends with the link to its holder: at once where that process is killed, after the lease where its host is gone.
 """
 
 from __future__ import annotations
@@ -28,9 +28,13 @@ MAX_BYTES = 64 << 10
 
 
 class _Word(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What its sender holds; with a number and no addressee a greeting, with both an answer to one."""
+    """What its sender holds; with a number and no addressee a greeting, with both an answer to one.
+
+    changes: how often what it holds has changed, for words may overtake each other.
+    """
 
     held: Annotated[tuple[_Key, ...], msgspec.Meta(max_length=64)]
+    changes: Annotated[int, msgspec.Meta(ge=0)]
     number: int = 0
     to: str = ""
 
@@ -43,7 +47,8 @@ class Presence:
         self._send = send
         self._changed = threading.Condition(threading.RLock())
         self._mine: list[str] = []
-        self._theirs: dict[str, frozenset[str]] = {}
+        self._changes = 0
+        self._theirs: dict[str, _Word] = {}
         self._answers: dict[str, int] = {}
         self._seen: set[str] = set()
         self._watchers: list[tuple[str, Watcher]] = []
@@ -53,15 +58,19 @@ class Presence:
     def hold(self, key: str) -> Closing:
         with self._changed:
             self._mine.append(key)
+            self._changes += 1
             self._tell()
         self._send(self._word())
+        self._greet_soon()
 
         def release() -> None:
             with self._changed:
                 self._mine.remove(key)
+                self._changes += 1
                 self._tell()
             with suppress(TransportError):
                 self._send(self._word())
+                self._greet_soon()
 
         return Closer(release)
 
@@ -102,11 +111,7 @@ class Presence:
         """A link to `peer` came up: learn what it holds."""
         with self._changed:
             self._answers.setdefault(peer, 0)
-            self._greet_again = True
-            if self._greeting:
-                return
-            self._greeting = True
-        threading.Thread(target=self._greet, name="greet", daemon=True).start()
+        self._greet_soon()
 
     def lost(self, peer: str) -> None:
         """The link to `peer` ended, and with it what it held."""
@@ -127,7 +132,8 @@ class Presence:
         with self._changed:
             # Where the link is gone, or not known yet, there is nothing to note: its coming up asks again.
             if peer in self._answers:
-                self._theirs[peer] = frozenset(word.held)
+                if peer not in self._theirs or word.changes >= self._theirs[peer].changes:
+                    self._theirs[peer] = word
                 if word.to == self._name:
                     self._answers[peer] = max(self._answers[peer], word.number)
                 self._tell()
@@ -135,6 +141,17 @@ class Presence:
         if word.number > 0 and not word.to:
             with suppress(TransportError):
                 self._send(self._word(word.number, peer))
+
+    def _greet_soon(self) -> None:
+        """Greet in the background: a busy link may lose a word, and a greeting is repeated until it is answered."""
+        with self._changed:
+            if not self._answers:
+                return
+            self._greet_again = True
+            if self._greeting:
+                return
+            self._greeting = True
+        threading.Thread(target=self._greet, name="greet", daemon=True).start()
 
     def _greet(self) -> None:
         while True:
@@ -148,10 +165,10 @@ class Presence:
 
     def _word(self, number: int = 0, to: str = "") -> bytes:
         with self._changed:
-            return msgspec.json.encode(_Word(tuple(self._mine), number, to))
+            return msgspec.json.encode(_Word(tuple(self._mine), self._changes, number, to))
 
     def _tell(self) -> None:
-        now = frozenset(self._mine).union(*self._theirs.values())
+        now = frozenset(self._mine).union(*(word.held for word in self._theirs.values()))
         changes = [(token, True) for token in sorted(now - self._seen)]
         changes += [(token, False) for token in sorted(self._seen - now)]
         self._seen = set(now)

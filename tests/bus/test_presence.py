@@ -72,6 +72,34 @@ def test_a_greeting_that_is_lost_is_repeated(links: Links) -> None:
     soon(a, {"live/pnp"})
 
 
+def test_what_is_held_or_let_go_is_said_again_where_the_word_was_lost(links: Links) -> None:
+    a, b = links.open("a"), links.open("b")
+    links.link("a", "b")
+    assert b.settle(2.0)
+    links.lossy = 1
+    held = b.hold("live/pnp")
+    soon(a, {"live/pnp"})
+    links.lossy = 1
+    held.close()
+    soon(a, set())
+
+
+def test_a_word_that_was_overtaken_by_a_newer_one_changes_nothing(links: Links) -> None:
+    """An answer that was put into words before a token was held, and sent after that was told."""
+    a, b = links.open("a"), links.open("b")
+    links.link("a", "b")
+    changes: list[bool] = []
+    a.watch("live/*", lambda key, alive: changes.append(alive))
+    held = b.hold("live/pnp")
+    soon(a, {"live/pnp"})
+    a.heard("b", b'{"held":[],"changes":0,"number":1,"to":"a"}')
+    assert a.live("live/*") == {"live/pnp"}
+    held.close()
+    soon(a, set())
+    a.heard("b", b'{"held":["live/pnp"],"changes":1}')
+    assert changes == [True, False]
+
+
 def test_a_lost_link_takes_its_tokens_along_and_a_late_word_does_not_bring_them_back(links: Links) -> None:
     a, b = links.open("a"), links.open("b")
     links.link("a", "b")
@@ -79,7 +107,7 @@ def test_a_lost_link_takes_its_tokens_along_and_a_late_word_does_not_bring_them_
     soon(a, {"live/pnp"})
     links.cut("a", "b")
     assert a.live("live/*") == set()
-    a.heard("b", b'{"held":["live/pnp"]}')
+    a.heard("b", b'{"held":["live/pnp"],"changes":9}')
     assert a.live("live/*") == set()
     links.link("a", "b")
     soon(a, {"live/pnp"})
@@ -114,12 +142,14 @@ NO_WORDS = [
     b"",
     b"\xff\xfe",
     b"[]",
-    b'{"held":3}',
-    b'{"held":[3]}',
-    b'{"held":[],"surprise":1}',
-    b'{"held":["x"],"number":{}}',
-    b'{"held":["' + b"k" * 513 + b'"]}',
-    b'{"held":["live/x"]}' + b" " * MAX_BYTES,
+    b'{"held":[]}',
+    b'{"held":[],"changes":-1}',
+    b'{"held":3,"changes":9}',
+    b'{"held":[3],"changes":9}',
+    b'{"held":[],"changes":9,"surprise":1}',
+    b'{"held":["x"],"changes":9,"number":{}}',
+    b'{"held":["' + b"k" * 513 + b'"],"changes":9}',
+    b'{"held":["live/x"],"changes":9}' + b" " * MAX_BYTES,
     b"[" * 5000,
 ]
 

@@ -72,7 +72,8 @@ def refine(
     after = photometric.loss(judge, refined)
     if after >= before:
         return RefinementResult(cam_from_object, False, before, after, steps)
-    covariance = photometric.covariance(judge, refined, camera, config.shared_error)
+    times = min(config.samples, len(pixels) - held_out) / held_out
+    covariance = photometric.covariance(judge, refined, camera, config.shared_error, times)
     return RefinementResult(refined, True, before, after, steps, covariance)
 
 

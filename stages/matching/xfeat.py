@@ -27,6 +27,7 @@ WEIGHTS = WeightsFile(
 )
 _STRIDE = 32
 _MEAN_OF_CHANNELS = np.full((1, 3), 1 / (3 * 255), np.float32)
+_NORM_EPSILON = 1e-5
 _MIN_HEAT = 0.05
 _LEAST_HEAT = 1e-6
 _MIN_COSINE = 0.6
@@ -38,6 +39,7 @@ class XFeatExtractor:
     def __init__(self, config: MatchingConfig) -> None:
         path = find_weights(WEIGHTS, config.weights, config.allow_download)
         network = _without_norms(load_network(XFeatModel(), path, config.device))
+        network.norm = torch.nn.Identity()
         self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._max_keypoints, self._device = config.max_keypoints, config.device
 
@@ -45,7 +47,7 @@ class XFeatExtractor:
     def extract(self, image: np.ndarray, mask: np.ndarray | None = None) -> Features:
         """Features of an image (h, w, 3) uint8 where mask (h, w) bool is true."""
         height, width = image.shape[:2]
-        dense, logits, reliability = self._network(self._padded(image))
+        dense, logits, reliability = self._network(self._normalised(image))
         heat = functional.pixel_shuffle(functional.softmax(logits, 1)[:, :64], 8)
         heat[..., height:, :], heat[..., width:] = 0, 0
         if mask is not None:
@@ -55,10 +57,14 @@ class XFeatExtractor:
         descriptors = _sample(functional.normalize(dense, dim=1), x, y, heat.shape, "bicubic")
         return Features(pixels.cpu().numpy(), (width, height), functional.normalize(descriptors, dim=1))
 
-    def _padded(self, image: np.ndarray) -> torch.Tensor:
-        grey = torch.from_numpy(cv2.transform(image.astype(np.float32), _MEAN_OF_CHANNELS)).to(self._device)[None, None]
+    def _normalised(self, image: np.ndarray) -> torch.Tensor:
+        """Grey values (1, 1, h', w'), of mean 0 and deviation 1 as the network has them, of a padded image."""
+        grey = cv2.transform(image.astype(np.float32), _MEAN_OF_CHANNELS)
         bottom, right = (-image.shape[0]) % _STRIDE, (-image.shape[1]) % _STRIDE
-        return functional.pad(grey, (0, right, 0, bottom), mode="replicate")
+        grey = cv2.copyMakeBorder(grey, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
+        mean, deviation = (float(value[0, 0]) for value in cv2.meanStdDev(grey))
+        scale = 1 / np.sqrt(deviation**2 + _NORM_EPSILON)
+        return torch.from_numpy((grey - np.float32(mean)) * np.float32(scale)).to(self._device)[None, None]
 
     def _peaks(self, heat: torch.Tensor, reliability: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The strongest pixels (x, y) that are maxima of their 5 x 5 neighbourhood."""

@@ -14,15 +14,13 @@ _LEAST = 1e-14
 
 
 def twist_covariance(
-    jacobian: np.ndarray, weights: np.ndarray, pixels: np.ndarray, longer_side: int, variance: float, shared: float,
-    times: float = 1.0,
-) -> np.ndarray:  # fmt: skip
+    jacobian: np.ndarray, weights: np.ndarray, pixels: np.ndarray, longer_side: int, variance: float, shared: float
+) -> np.ndarray:
     """Covariance (6, 6) of the left twist that minimises weighted squared residuals.
 
     jacobian (n, k, 6) of k residuals of each of n pixels (n, 2), n > 0; weights (n,), 1 / variance up to a factor;
     variance: of a residual of weight 1; shared: standard deviation of a cell's offset as a multiple of a typical
     residual's; the image's longer side has eight cells. Directions that nothing determines have a huge variance.
-    times: the fit saw so many times as many residuals, which were like these; what is shared is not less for that.
     """
     weighted = weights[:, None, None] * jacobian
     inverse = _inverse(np.tensordot(weighted, jacobian, axes=((0, 1), (0, 1))))
@@ -33,7 +31,7 @@ def twist_covariance(
     np.add.at(sums, cells, weighted)
     typical = max(float((weights**2).sum() / max(weights.sum(), 1e-12)), 1e-12)
     together = np.tensordot(sums, sums, axes=((0, 1), (0, 1))) * (shared**2 / typical)
-    return variance * (inverse / times + inverse @ together @ inverse)
+    return variance * (inverse + inverse @ together @ inverse)
 
 
 def _inverse(hessian: np.ndarray) -> np.ndarray:

@@ -40,8 +40,8 @@ class RefinementConfig:
     """Adam's, in radians and in shares of the distance to the surface"""
     converged: float = 2e-5
     """a step that is smaller, in the same unit, is the last"""
-    shared_error: float = 0.4
-    """how far neighbouring pixels err together, as a multiple of their differences; found on several scenes"""
+    shared_error: float = 0.8
+    """how far neighbouring pixels err together, as a multiple of their differences in colour"""
 
     @property
     def on(self) -> bool:

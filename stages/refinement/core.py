@@ -72,8 +72,7 @@ def refine(
     after = photometric.loss(judge, refined)
     if after >= before:
         return RefinementResult(cam_from_object, False, before, after, steps)
-    times = min(config.samples, len(pixels) - held_out) / held_out
-    covariance = photometric.covariance(judge, refined, camera, config.shared_error, times)
+    covariance = photometric.covariance(judge, refined, camera, config.shared_error)
     return RefinementResult(refined, True, before, after, steps, covariance)
 
 

@@ -64,15 +64,3 @@ def test_what_nothing_determines_is_uncertain() -> None:
     covariance = twist_covariance(jacobian, np.ones(40), rng.uniform(0, 400, (40, 2)), 400, 1.0, 0.7)
     assert covariance[2, 2] > 1e8
     assert np.diag(covariance)[[0, 1, 3, 4, 5]].max() < 1
-
-
-def test_more_measurements_lessen_their_own_errors_and_not_the_shared_ones() -> None:
-    rng = np.random.default_rng(3)
-    jacobian, pixels = rng.normal(size=(60, 2, 6)), rng.uniform(0, 400, (60, 2))
-
-    def covariance(shared: float, times: float) -> np.ndarray:
-        return twist_covariance(jacobian, np.ones(60), pixels, 400, 1.0, shared, times)
-
-    own, both = covariance(0.0, 1.0), covariance(0.7, 1.0)
-    np.testing.assert_allclose(covariance(0.0, 4.0), own / 4, rtol=1e-9)
-    np.testing.assert_allclose(covariance(0.7, 4.0), both - own * 3 / 4, rtol=1e-9)

@@ -72,12 +72,10 @@ def _read(path: Path, use: Callable[[Image.Image], _Result]) -> _Result:
         with Image.open(path) as image:
             return use(image)
     except FileNotFoundError as error:
-        raise DatasetError(f"{path}: no such image; restore the file or take it out of the dataset") from error
+        raise DatasetError(f"{path}: no such image; restore the file, or name another") from error
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         reason = "not an image" if isinstance(error, Image.UnidentifiedImageError) else error
-        raise DatasetError(
-            f"{path}: cannot be read ({reason}); restore the file or take it out of the dataset"
-        ) from error
+        raise DatasetError(f"{path}: cannot be read ({reason}); restore the file, or leave it out") from error
 
 
 def _load_array(path: Path) -> np.ndarray:

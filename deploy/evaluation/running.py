@@ -47,7 +47,9 @@ class Examination:
             began = time.perf_counter()
             found = finder.find(*question)
             seconds = time.perf_counter() - began
-            yield Answer(pair, found.cam_from_object, found.covariance, seconds, method.scale_known)
+            yield Answer(
+                pair, found.cam_from_object, found.covariance, seconds, method.scale_known, found.stage_ms
+            )
 
     def _question(self, pair: Pair) -> tuple[np.ndarray, Camera, np.ndarray]:
         return self.images[pair.seed, pair.image], self.dataset.images[pair.image].camera, pair.guess

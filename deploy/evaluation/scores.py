@@ -8,6 +8,7 @@ The keys of a method's scores, which programs may rely on:
   share_ok_right     of these, the ones with both errors below their limits
   mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te   over the pairs with a pose; null without any
   seconds_per_image  mean, all passes and refinement included
+  stage_ms           {stage: mean}, of the pass that counts, over the pairs with a pose; null for a published method
   covariance         {50, 90, 99}: share of the true poses inside the ellipsoid of that probability; null without any
   add                {diameter, add_below_0.1d, add_s_below_0.1d, auc_add, auc_add_s}: see deploy.evaluation.surface;
                      null without a surface
@@ -17,8 +18,8 @@ What speaks of translations is null for a method that cannot tell them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,7 @@ class Answer:
     covariance: np.ndarray | None
     seconds: float
     scale_known: bool = True
+    stage_ms: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def errors(self) -> tuple[float, float] | None:
@@ -89,6 +91,7 @@ def score(answers: Sequence[Answer], surface: Surface | None = None) -> dict[str
         **_statistics("re_deg", found[:, 0]),
         **_statistics("te", found[:, 1] if scale_known else found[:0, 1]),
         "seconds_per_image": float(np.mean([answer.seconds for answer in answers])),
+        "stage_ms": _stage_means([answer.stage_ms for answer in answers if answer.errors is not None]),
         "covariance": _coverage(distances),
         "add": _surface_scores(answers, surface) if surface is not None and scale_known else None,
     }
@@ -114,6 +117,11 @@ def _statistics(name: str, values: np.ndarray) -> dict[str, float | None]:
         f"median_{name}": float(np.median(values)),
         f"p90_{name}": float(np.quantile(values, 0.9)),
     }
+
+
+def _stage_means(stage_ms: Sequence[Mapping[str, float]]) -> dict[str, float] | None:
+    stages = dict.fromkeys(stage for ms in stage_ms for stage in ms)
+    return {stage: float(np.mean([ms.get(stage, 0.0) for ms in stage_ms])) for stage in stages} or None
 
 
 def _coverage(distances: Sequence[float]) -> dict[str, float] | None:

@@ -56,6 +56,14 @@ def test_scores_by_hand() -> None:
     assert scores["covariance"] is None
 
 
+def test_stages_times_are_means_over_the_answered_pairs() -> None:
+    pose = np.eye(4)
+    times: list[dict[str, float]] = [{"pnp": 2.0, "retrieval": 4.0}, {"pnp": 4.0}]
+    answers = [Answer(PAIR, pose, None, 1.0, stage_ms=ms) for ms in times]
+    assert score([*answers, answer(None)])["stage_ms"] == {"pnp": 3.0, "retrieval": 2.0}
+    assert score([answer(1)])["stage_ms"] is None
+
+
 def test_without_any_pose_the_errors_are_unknown() -> None:
     scores = score([answer(None), answer(None)])
     assert scores["share_ok"] == scores["share_re_below_5deg"] == 0

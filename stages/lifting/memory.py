@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+
+from stages.last_used import LastUsed
 
 _VIEWS = 128
 
@@ -21,20 +22,16 @@ class ConsistencyMemory:
     """
 
     def __init__(self, views: int = _VIEWS) -> None:
-        self._capacity = views
-        self._views: OrderedDict[str, dict[int, float]] = OrderedDict()
+        self._views: LastUsed[dict[int, float]] = LastUsed(views)
 
     def of(self, view_id: str) -> Remember:
         """Gives m (n,) float32 at pixels (n, 2) of a view; `look` at the indices (k,) of those that are not known."""
         return partial(self._get, view_id)
 
     def _get(self, view_id: str, pixels: np.ndarray, look: Look) -> np.ndarray:
-        known = self._views.pop(view_id, {})
+        known = self._views.get(view_id, dict)
         keys = np.ascontiguousarray(pixels, np.float32).view(np.int64)[:, 0].tolist()
         new = {key: i for i, key in enumerate(keys) if key not in known}
         if new:
             known.update(zip(new, look(np.array(list(new.values()))).tolist(), strict=True))
-        self._views[view_id] = known
-        while len(self._views) > self._capacity:
-            self._views.popitem(last=False)
         return np.array([known[key] for key in keys], np.float32)

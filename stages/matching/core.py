@@ -1,22 +1,22 @@
 """Matching a rendered view with a camera image: which pixels of the two show the same point of the surface.
 
-A matcher is a class with the two methods of `Matcher`. To add one, write it in a file of this folder beside the
-others and name it in `MATCHERS`; nothing else in fieldpose needs to know.
+A matcher is a class with the two methods of `Matcher`, and that of `ExtractsAtOnce` if it gains by it. To add one,
+write it in a file of this folder beside the others and name it in `MATCHERS`; nothing else in fieldpose needs to know.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 
 from stages.errors import ConfigError
+from stages.last_used import LastUsed
 from stages.matching.subpixel import align_patches
 
 MATCHERS = {
@@ -30,6 +30,7 @@ MATCHERS = {
 """Name in the configuration -> module and the callable in it that makes a Matcher of a MatchingConfig."""
 
 _KEPT_FRAMES = 2
+_WHOLE = np.ones(2, np.float32)
 
 
 @dataclass(frozen=True)
@@ -120,12 +121,22 @@ def shrink(image: np.ndarray, longer_side: int) -> tuple[np.ndarray, np.ndarray]
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.array(size, np.float32) / (width, height)
 
 
+@runtime_checkable
+class ExtractsAtOnce(Protocol):
+    """A matcher that takes the features of several images in less time than one after the other."""
+
+    def extract_all(self, images: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> list[Features]:
+        """What `extract` gives for images of one size, each with its mask."""
+        ...
+
+
 class PairMatcher:
     """Matches views with frames and keeps the features of the last ones, for views and frames that come again."""
 
     def __init__(self, matcher: Matcher, config: MatchingConfig) -> None:
         self._matcher, self._config = matcher, config
-        self._views, self._frames = _LastUsed(config.kept_views), _LastUsed(_KEPT_FRAMES)
+        self._views: LastUsed[_Seen] = LastUsed(config.kept_views)
+        self._frames: LastUsed[_Seen] = LastUsed(_KEPT_FRAMES)
 
     def match(
         self,
@@ -139,8 +150,8 @@ class PairMatcher:
 
         Only pixels of the view that show the object are matched. Features are kept under the keys, where given.
         """
-        view = self._views.get(view_key, lambda: self._of_view(view_rgb, view_opacity))
-        frame = self._frame(frame_image, self._config.frame_size or max(view_rgb.shape[:2]), frame_key)
+        longer_side = self._config.frame_size or max(view_rgb.shape[:2])
+        view, frame = self._both(view_rgb, view_opacity, frame_image, longer_side, view_key, frame_key)
         matched = self._matcher.match(view.features, frame.features)
         pixels_b, confidence = matched.pixels_b, matched.confidence
         if self._config.patch_px and not self._matcher.placed_between_pixels:
@@ -152,25 +163,38 @@ class PairMatcher:
 
     def view_features(self, rgb: np.ndarray, opacity: np.ndarray, view_key: Hashable) -> Features:
         """The features of a view (h, w, 3) uint8 with opacity (h, w); kept for a match, as there."""
-        seen: _Seen = self._views.get(view_key, lambda: self._of_view(rgb, opacity))
-        return seen.features
+        return self._view(rgb, opacity, view_key).features
 
     def frame_features(self, frame_image: np.ndarray, longer_side: int, frame_key: Hashable | None = None) -> Features:
         """The features of a frame (h, w, 3) uint8, shrunk to `longer_side`; kept for a match at that size."""
         return self._frame(frame_image, longer_side, frame_key).features
 
+    def _both(
+        self, rgb: np.ndarray, opacity: np.ndarray, frame_image: np.ndarray, longer_side: int,
+        view_key: Hashable | None, frame_key: Hashable | None,
+    ) -> tuple[_Seen, _Seen]:  # fmt: skip
+        sized_key = _sized(frame_key, longer_side)
+        if isinstance(self._matcher, ExtractsAtOnce) and view_key not in self._views and sized_key not in self._frames:
+            small, scale = shrink(frame_image, longer_side)
+            if small.shape == rgb.shape:
+                mask = visible_mask(opacity, self._config.erode_px)
+                in_view, in_frame = self._matcher.extract_all([(rgb, mask), (small, None)])
+                view = self._views.get(view_key, lambda: _seen(in_view, rgb))
+                return view, self._frames.get(sized_key, lambda: _seen(in_frame, small, scale))
+        return self._view(rgb, opacity, view_key), self._frame(frame_image, longer_side, frame_key)
+
+    def _view(self, rgb: np.ndarray, opacity: np.ndarray, key: Hashable | None) -> _Seen:
+        def look() -> _Seen:
+            return _seen(self._matcher.extract(rgb, visible_mask(opacity, self._config.erode_px)), rgb)
+
+        return self._views.get(key, look)
+
     def _frame(self, image: np.ndarray, longer_side: int, key: Hashable | None) -> _Seen:
-        sized_key = None if key is None else (key, longer_side)
-        seen: _Seen = self._frames.get(sized_key, lambda: self._of_frame(image, longer_side))
-        return seen
+        def look() -> _Seen:
+            small, scale = shrink(image, longer_side)
+            return _seen(self._matcher.extract(small), small, scale)
 
-    def _of_view(self, rgb: np.ndarray, opacity: np.ndarray) -> _Seen:
-        features = self._matcher.extract(rgb, visible_mask(opacity, self._config.erode_px))
-        return _Seen(features, cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), np.ones(2, np.float32))
-
-    def _of_frame(self, image: np.ndarray, longer_side: int) -> _Seen:
-        small, scale = shrink(image, longer_side)
-        return _Seen(self._matcher.extract(small), cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), scale)
+        return self._frames.get(_sized(key, longer_side), look)
 
 
 @dataclass(frozen=True)
@@ -182,18 +206,9 @@ class _Seen:
     scale: np.ndarray
 
 
-class _LastUsed:
-    """The last `capacity` values by key; a key of None is never kept."""
+def _seen(features: Features, image: np.ndarray, scale: np.ndarray = _WHOLE) -> _Seen:
+    return _Seen(features, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), scale)
 
-    def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
-        self._values: OrderedDict[Hashable, Any] = OrderedDict()
 
-    def get(self, key: Hashable | None, make: Callable[[], Any]) -> Any:
-        if key is None:
-            return make()
-        value = self._values.pop(key) if key in self._values else make()
-        self._values[key] = value
-        while len(self._values) > self._capacity:
-            self._values.popitem(last=False)
-        return value
+def _sized(frame_key: Hashable | None, longer_side: int) -> Hashable | None:
+    return None if frame_key is None else (frame_key, longer_side)

@@ -7,6 +7,7 @@ parabola through the heatmap's peak places them between pixels.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import cv2
@@ -43,19 +44,34 @@ class XFeatExtractor:
         self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._max_keypoints, self._device = config.max_keypoints, config.device
 
-    @torch.inference_mode()
     def extract(self, image: np.ndarray, mask: np.ndarray | None = None) -> Features:
         """Features of an image (h, w, 3) uint8 where mask (h, w) bool is true."""
-        height, width = image.shape[:2]
-        dense, logits, reliability = self._network(self._normalised(image))
+        return self.extract_all([(image, mask)])[0]
+
+    @torch.inference_mode()
+    def extract_all(self, images: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> list[Features]:
+        """`extract` of several images of one size, each with its mask, in one run of the network."""
+        batch = torch.cat([self._normalised(image) for image, _ in images])
+        dense, logits, reliability = self._network(batch)
         heat = functional.pixel_shuffle(functional.softmax(logits, 1)[:, :64], 8)
+        dense = functional.normalize(dense, dim=1)
+        return [
+            self._features(heat[i : i + 1], reliability[i : i + 1], dense[i : i + 1], image.shape[:2], mask)
+            for i, (image, mask) in enumerate(images)
+        ]
+
+    def _features(
+        self, heat: torch.Tensor, reliability: torch.Tensor, dense: torch.Tensor, size: tuple[int, int],
+        mask: np.ndarray | None,
+    ) -> Features:  # fmt: skip
+        height, width = size
         heat[..., height:, :], heat[..., width:] = 0, 0
         if mask is not None:
             heat[0, 0, :height, :width] *= torch.from_numpy(mask).to(heat.device)
         x, y = self._peaks(heat, reliability)
         pixels = torch.stack([x, y], 1).float() + _peak_offsets(heat[0, 0], x, y)
-        descriptors = _sample(functional.normalize(dense, dim=1), x, y, heat.shape, "bicubic")
-        return Features(pixels.cpu().numpy(), (width, height), functional.normalize(descriptors, dim=1))
+        descriptors = functional.normalize(_sample(dense, x, y, heat.shape, "bicubic"), dim=1)
+        return Features(pixels.cpu().numpy(), (width, height), descriptors)
 
     def _normalised(self, image: np.ndarray) -> torch.Tensor:
         """Grey values (1, 1, h', w'), of mean 0 and deviation 1 as the network has them, of a padded image."""
@@ -82,7 +98,8 @@ class XFeatMatcher:
     placed_between_pixels = False
 
     def __init__(self, config: MatchingConfig) -> None:
-        self.extract = XFeatExtractor(config).extract
+        extractor = XFeatExtractor(config)
+        self.extract, self.extract_all = extractor.extract, extractor.extract_all
         self._min_cosine = _MIN_COSINE if config.min_confidence is None else config.min_confidence
 
     @torch.inference_mode()

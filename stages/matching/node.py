@@ -26,10 +26,14 @@ class MatchingNode(JoinedHandler):
         self._config = config
 
     def start(self) -> None:
-        self._pairs = PairMatcher(build_matcher(self._config), self._config)
+        matcher = build_matcher(self._config)
+        self._pairs = PairMatcher(matcher, self._config)
         noise = np.random.default_rng(0).integers(0, 256, (400, 400, 3), np.uint8)
-        # The first inference is slow: the networks' kernels are chosen in it.
-        self._pairs.match(noise, np.ones((400, 400), np.float32), noise)
+        solid, once = np.ones((400, 400), np.float32), PairMatcher(matcher, self._config)
+        # The first inferences are slow, for networks choose their kernels in them: for two images, and for one, which
+        # a frame is whose view comes again.
+        for frame_key in range(2):
+            once.match(noise, solid, noise, "noise", frame_key)
 
     def process(self, joined: dict[Topic, Message]) -> Iterable[Output]:
         view, frame = cast(View, joined[VIEW]), cast(Frame, joined[FRAME])

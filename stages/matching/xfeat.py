@@ -35,7 +35,7 @@ _MIN_COSINE = 0.6
 
 
 class XFeatExtractor:
-    """Sparse XFeat features of one image; `data` holds the (n, 64) unit descriptors."""
+    """Sparse XFeat features; `data` holds the (n, 64) unit descriptors."""
 
     def __init__(self, config: MatchingConfig) -> None:
         path = find_weights(WEIGHTS, config.weights, config.allow_download)
@@ -51,7 +51,7 @@ class XFeatExtractor:
     @torch.inference_mode()
     def extract_all(self, images: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> list[Features]:
         """`extract` of several images of one size, each with its mask, in one run of the network."""
-        batch = torch.cat([self._normalised(image) for image, _ in images])
+        batch = torch.cat([self.normalised(image) for image, _ in images])
         dense, logits, reliability = self._network(batch)
         heat = functional.pixel_shuffle(functional.softmax(logits, 1)[:, :64], 8)
         dense = functional.normalize(dense, dim=1)
@@ -69,11 +69,11 @@ class XFeatExtractor:
         if mask is not None:
             heat[0, 0, :height, :width] *= torch.from_numpy(mask).to(heat.device)
         x, y = self._peaks(heat, reliability)
-        pixels = torch.stack([x, y], 1).float() + _peak_offsets(heat[0, 0], x, y)
+        pixels = torch.stack([x, y], 1).float() + peak_offsets(heat[0, 0], x, y)
         descriptors = functional.normalize(_sample(dense, x, y, heat.shape, "bicubic"), dim=1)
         return Features(pixels.cpu().numpy(), (width, height), descriptors)
 
-    def _normalised(self, image: np.ndarray) -> torch.Tensor:
+    def normalised(self, image: np.ndarray) -> torch.Tensor:
         """Grey values (1, 1, h', w'), of mean 0 and deviation 1 as the network has them, of a padded image."""
         grey = cv2.transform(image.astype(np.float32), _MEAN_OF_CHANNELS)
         bottom, right = (-image.shape[0]) % _STRIDE, (-image.shape[1]) % _STRIDE
@@ -112,7 +112,10 @@ class XFeatMatcher:
 
 
 def mutual_nearest(first: torch.Tensor, second: torch.Tensor) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-    """Indices into unit descriptors (n, d) and (m, d) that are each other's nearest, and their cosines (CPU)."""
+    """Indices into unit descriptors (n, d) and (m, d) that are each other's nearest, and their cosines (CPU).
+
+    Of several that are equally near, as equal ones are, all of the first are paired, with one of the second.
+    """
     if min(len(first), len(second)) == 0:
         nothing = np.zeros(0, np.int64)
         return nothing, nothing, torch.zeros(0)
@@ -140,7 +143,7 @@ def _sample(values: torch.Tensor, x: torch.Tensor, y: torch.Tensor, shape: torch
     return sampled[0, :, 0].T
 
 
-def _peak_offsets(heat: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+def peak_offsets(heat: torch.Tensor, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
     """Where the parabola through each peak and its neighbours is highest, per axis: (n, 2), within half a pixel."""
     height, width = heat.shape
     middle, offsets = torch.log(heat[y, x].clamp_min(_LEAST_HEAT)), []

@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 
-from stages.geometry import Camera
-from stages.nerf.kernels.types import Tiles
 from stages.nerf.metadata import Space
-
-TILE = 8
 
 
 def normalised(
@@ -30,22 +24,3 @@ def by_object_rays(space: Space, jacobian: np.ndarray, unit: np.ndarray, length:
     along = np.sum(by_unit * unit[:, None], axis=-1, keepdims=True)
     by_direction = (by_unit - along * unit[:, None]) / (length[:, None, None] * scale)
     return np.concatenate([jacobian[..., :3] / scale, by_direction], axis=-1)
-
-
-@lru_cache(maxsize=2)
-def view_tiles(camera: Camera) -> Tiles:
-    """The rays through every pixel; the same for every pose."""
-    pixel = tile_order(camera.width, camera.height)
-    directions = camera.directions(camera.grid()[pixel])
-    length = np.linalg.norm(directions, axis=1)
-    y, x = np.divmod(pixel, camera.width)
-    columns, rows = -(-camera.width // TILE), -(-camera.height // TILE)
-    first = np.searchsorted((y // TILE) * columns + x // TILE, np.arange(rows * columns + 1))
-    return Tiles(first, pixel, directions / length[:, None], length)
-
-
-def tile_order(width: int, height: int, tile: int = TILE) -> np.ndarray:
-    """Row-major pixel indices in the order of square tiles."""
-    y, x = np.divmod(np.arange(width * height), width)
-    key = ((y // tile) * (-(-width // tile)) + x // tile) * tile * tile + (y % tile) * tile + x % tile
-    return np.argsort(key, kind="stable")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from stages.geometry import Camera, camera_centre
@@ -14,8 +12,9 @@ from stages.nerf.kernels.sight import block_centres, block_radius, tile_limits
 from stages.nerf.kernels.types import Net
 from stages.nerf.kernels.vectors import WIDTH, reads_half_floats
 from stages.nerf.metadata import FieldMetadata
-from stages.nerf.normalise import TILE, by_object_rays, normalised, view_tiles
+from stages.nerf.normalise import by_object_rays, normalised
 from stages.nerf.rendering_api import RenderedRays, RenderedView
+from stages.nerf.tiles import TILE, view_tiles
 from stages.nerf.workers import Workers
 
 PACKET = TILE * TILE
@@ -23,7 +22,7 @@ PER_RAY = 4
 STOP_BELOW = 1e-2
 JACOBIAN_STOP_BELOW = 1e-3
 CHUNK = 1024
-_TILES_AT_ONCE = 32
+TILE_CHUNK = 32
 JACOBIAN_ROWS = 8192
 
 
@@ -43,23 +42,23 @@ class NumbaRenderer:
     def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
         """See RayRenderer."""
         o, d, length = normalised(self.metadata.space, origins, directions)
-        traced = self._trace(o, d, _everywhere(len(o)))
-        return replace(traced, depth=traced.depth / length)
-
-    def _trace(self, o: np.ndarray, d: np.ndarray, limits: np.ndarray) -> RenderedRays:
         n = len(o)
         rgb, depth, opacity = np.empty((n, 3), np.float32), np.empty(n, np.float32), np.empty(n, np.float32)
         jitter = np.full(n, 0.5, np.float32)
         evaluated = self._workers.each(
             n,
-            int(np.clip(n // (4 * self._workers.threads), PACKET, CHUNK)),
+            self._chunk(n, PACKET, CHUNK),
             lambda s, a, b: render(
-                self._net, self._domain, o, d, jitter, limits, self._background, a, b,
+                self._net, self._domain, o, d, jitter, self._background, a, b,
                 PER_RAY, self.stop_below, s.samples, s.rays, rgb, depth, opacity,
             ),
         )  # fmt: skip
         self.samples_evaluated += sum(evaluated)  # type: ignore[arg-type]
-        return RenderedRays(np.clip(rgb, 0, 1, out=rgb), depth, opacity)
+        return RenderedRays(np.clip(rgb, 0, 1, out=rgb), depth / length, opacity)
+
+    def _chunk(self, total: int, least: int, most: int) -> int:
+        """So many at once that each thread comes several times: some take much longer than others."""
+        return int(np.clip(total // (4 * self._workers.threads), least, most))
 
     def render_rays_jacobian(
         self, origins: np.ndarray, directions: np.ndarray, channel_weights: np.ndarray
@@ -95,7 +94,7 @@ class NumbaRenderer:
         rgb, depth, opacity = np.empty((n, 3), np.uint8), np.empty(n, np.float32), np.empty(n, np.float32)
         evaluated = self._workers.each(
             len(limits),
-            _TILES_AT_ONCE,
+            self._chunk(len(limits), 1, TILE_CHUNK),
             lambda s, a, b: render_tiles(
                 self._net, self._domain, tiles, limits, turn, origin, np.float32(space.scale), self._background, a, b,
                 PER_RAY, self.stop_below, s.samples, s.rays, rgb, depth, opacity,

@@ -63,7 +63,7 @@ class Aligner:
         in_view = points @ self._view_pose[:3, :3].T + self._view_pose[:3, 3]
         self._pixels = self._view_camera.project(in_view)
         self._inverse_depth = np.where(in_view[:, 2] > 0, 1 / np.maximum(in_view[:, 2], 1e-9), np.nan)
-        self._slopes = inverse_depth_slopes(pictures.depth, self._pixels)
+        self._slopes = inverse_depth_slopes(pictures.depth, self._pixels).astype(np.float64)
 
     def rounds(self) -> Iterator[tuple[int, float]]:
         """Level, and largest error that would not surprise, in pixels of the frame, of each round: coarse to fine."""

@@ -30,7 +30,7 @@ def warp_patches(
 
     pixels: (n, 2) of the view.  inverse_depth: (n,) there, NaN where there is none, and its derivatives by the pixel,
     slopes (n, 2): a surface is taken to be its tangent plane.  view, frame: fx, fy, cx and cy of each.
-    frame_from_view: (4, 4).  distortion: (5,), of the frame.  size: the frame's, width and height.  All float64.
+    frame_from_view: (4, 4).  distortion: (5,), of the frame.  All these float64.  size: the frame's width and height.
     places are the pixels of the frame; view_from_frame is how small offsets from there become offsets in the view;
     seen is whether the point is in the frame, ahead of the camera, and the patch neither too flat nor too steep.
     """

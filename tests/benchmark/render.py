@@ -166,7 +166,7 @@ def _median_ms(field: Field, view: View) -> tuple[float, float]:
 
 
 def _rays(field: Field, views: list[View]) -> dict[str, float]:
-    """Rays as lifting asks for them (thousands, through surfaces in several views) and as refinement does."""
+    """Thousands of rays through surfaces in several views, in no order, and rays as refinement asks for them."""
     rng = np.random.default_rng(0)
     renderer = NumbaRenderer(field, machine.cores())
     pixels = [v.camera.grid()[rng.permutation(v.camera.width * v.camera.height)] for v in views]

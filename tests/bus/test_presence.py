@@ -138,6 +138,19 @@ def test_settling_waits_for_every_link_and_says_when_one_does_not_answer(links: 
     assert a.settle(2.0)
 
 
+def test_nobody_is_greeted_once_it_is_closed(links: Links) -> None:
+    a = links.open("a")
+    a.linked("mute")
+    began = time.monotonic()
+    a.close()
+    assert time.monotonic() - began < 1.0
+    assert not any(thread.name == "greet" and thread.is_alive() for thread in threading.enumerate())
+    a.linked("another")
+    assert not a.settle(5.0)
+    assert time.monotonic() - began < 2.0
+    assert not any(thread.name == "greet" and thread.is_alive() for thread in threading.enumerate())
+
+
 NO_WORDS = [
     b"",
     b"\xff\xfe",

@@ -249,7 +249,7 @@ class TestProcesses:
     def test_a_flood_of_greetings_stops_nobody(self, hub: str, connect: Connect) -> None:
         bus, crowd = connect(hub), connect(hub)
         meet(crowd, bus)
-        greeting = b'{"held": [], "number": 1}' + b" " * 8192
+        greeting = b'{"held": [], "changes": 0, "number": 1}' + b" " * 8192
         held = threading.Event()
 
         def hold() -> None:

@@ -7,7 +7,7 @@ from numba import njit
 
 from stages.fastmath import FASTMATH
 from stages.nerf.kernels.march import begin
-from stages.nerf.kernels.packet import shade, surface, trace
+from stages.nerf.kernels.packet import forward, shade, surface, trace
 from stages.nerf.kernels.sight import narrow
 from stages.nerf.kernels.types import Domain, Net, Rays, Samples, Tiles
 
@@ -19,7 +19,6 @@ def render(
     origins: np.ndarray,
     directions: np.ndarray,
     jitter: np.ndarray,
-    limits: np.ndarray,
     background: np.ndarray,
     first: int,
     last: int,
@@ -31,18 +30,13 @@ def render(
     depth: np.ndarray,
     opacity: np.ndarray,
 ) -> int:
-    """Fill rgb, depth (distance along the unit direction, 0 where nothing) and opacity; return the samples used.
-
-    limits (n, 2): between which distances each ray is traced.
-    """
+    """Fill rgb, depth (distance along the unit direction, 0 where nothing) and opacity; return the samples used."""
     size = rays.t.shape[0]
     total = 0
     for start in range(first, last, size):
         count = min(size, last - start)
-        begin(dom, origins, directions, jitter, start, count, rays)
-        narrow(dom, limits, start, count, rays)
-        _, evaluated = trace(
-            net, dom, origins, directions, start, count, per_ray, stop_below, False, samples, rays
+        _, evaluated = forward(
+            net, dom, origins, directions, jitter, start, count, per_ray, stop_below, False, samples, rays
         )
         total += evaluated
         for r in range(count):

@@ -25,3 +25,9 @@ def test_pairs_are_those_that_are_each_others_nearest(count: int, other_count: i
     }
     assert set(zip(in_first.tolist(), in_second.tolist(), strict=True)) == pairs
     np.testing.assert_allclose(cosine.numpy(), cosines[in_first, in_second])
+
+
+def test_equal_descriptors_share_their_nearest() -> None:
+    axes = torch.eye(4)
+    in_first, in_second, _ = mutual_nearest(axes[[0, 0, 1]], axes[[2, 0, 0, 1]])
+    assert list(zip(in_first.tolist(), in_second.tolist(), strict=True)) == [(0, 1), (1, 1), (2, 3)]

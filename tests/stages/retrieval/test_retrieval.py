@@ -51,6 +51,23 @@ def test_a_view_is_most_like_itself_and_no_more_are_named_than_asked_for() -> No
         assert ranking.similarity[0] > 0.95
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_the_shortlist_by_few_keypoints_holds_the_view_most_alike(seed: int) -> None:
+    """Of 300 views, each with a third of its keypoints seen by others too, the frame shows a half of one view's."""
+    rng = np.random.default_rng(seed)
+    shared, own = unit(rng, 400), unit(rng, 300, 128)
+    common = rng.random((300, 128)) < 0.33
+    own[common] = shared[rng.integers(0, 400, common.sum())]
+    retriever = Retriever(remembered(own))
+    for i in rng.integers(0, 300, 10):
+        seen = own[i][rng.random(128) < 0.5] + 0.08 * rng.normal(size=(1, 64))
+        frame = np.concatenate([seen, unit(rng, 64)]).astype(np.float32)
+        frame /= np.linalg.norm(frame, axis=1, keepdims=True)
+        ranking = retriever.rank(frame)
+        assert ranking.index[0] == i
+        assert len(ranking.index) == RetrievalConfig().candidates
+
+
 def test_nothing_is_like_an_image_without_keypoints() -> None:
     described = [*unit(np.random.default_rng(0), 3, 20), np.zeros((0, 64), np.float32)]
     kept = remembered(described)

@@ -206,8 +206,7 @@ def best_start(
     intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
     options = {
         "max_reproj_error": threshold, "max_iterations": config.iterations,
-        "min_iterations": config.least_iterations, "success_prob": config.confidence, "dyn_num_trials_mult": 1.0,
-        "seed": config.seed,
+        "min_iterations": config.least_iterations, "success_prob": config.confidence, "seed": config.seed,
     }  # fmt: skip
     found, about = poselib.estimate_absolute_pose(
         pixels, points, {**model, "params": intrinsics}, ransac_opt=options, bundle_opt={"max_iterations": 0}

@@ -31,6 +31,7 @@ MATCHERS = {
 
 _KEPT_FRAMES = 2
 _WHOLE = np.ones(2, np.float32)
+_WHOLE.setflags(write=False)
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,15 @@ class Matcher(Protocol):
         ...
 
 
+@runtime_checkable
+class ExtractsAtOnce(Protocol):
+    """A matcher that takes the features of several images in less time than one after the other."""
+
+    def extract_all(self, images: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> list[Features]:
+        """What `extract` gives for images of one size, each with its mask."""
+        ...
+
+
 def build_matcher(config: MatchingConfig) -> Matcher:
     """The matcher that the configuration names, weights read. Raises ConfigError or WeightsError."""
     if config.matcher not in MATCHERS:
@@ -117,15 +127,6 @@ def shrink(image: np.ndarray, longer_side: int) -> tuple[np.ndarray, np.ndarray]
     if size == (width, height):
         return image, _WHOLE
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.array(size, np.float32) / (width, height)
-
-
-@runtime_checkable
-class ExtractsAtOnce(Protocol):
-    """A matcher that takes the features of several images in less time than one after the other."""
-
-    def extract_all(self, images: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> list[Features]:
-        """What `extract` gives for images of one size, each with its mask."""
-        ...
 
 
 class PairMatcher:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-_HALF_PX = np.float64(0.5)
+_AROUND = np.array([[0.0, 0.0], [-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
+"""From a pixel to itself, and to half a pixel left, right, above and below."""
 _FLATTEST, _STEEPEST = 0.15, 6.0
 """Patches that cover less or more of the frame than these shares of themselves are seen too differently."""
 _AHEAD = 1e-6
@@ -38,9 +39,8 @@ def warp_patches(
     around = np.empty((5, 2))
     for i in range(pixels.shape[0]):
         seen[i] = True
-        for k in range(5):  # the pixel itself, and half a pixel left, right, above and below
-            dx = _HALF_PX * ((k == 2) - (k == 1)) if k < 3 else 0.0
-            dy = _HALF_PX * ((k == 4) - (k == 3)) if k > 2 else 0.0
+        for k in range(5):
+            dx, dy = _AROUND[k]
             u, v = (pixels[i, 0] + dx - view[2]) / view[0], (pixels[i, 1] + dy - view[3]) / view[1]
             # A plane's inverse depth is linear in the pixel; points scaled by it project to the same pixels.
             near = inverse_depth[i] + slopes[i, 0] * dx + slopes[i, 1] * dy

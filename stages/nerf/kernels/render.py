@@ -81,7 +81,7 @@ def render_tiles(
     """
     size, total = rays.t.shape[0], 0
     origins, directions = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
-    near_and_far, middle = np.empty((size, 2), np.float32), np.full(size, np.float32(0.5))
+    middle = np.full(size, np.float32(0.5))
     origins[:] = origin
     for tile in range(first, last):
         start, count = tiles.first[tile], tiles.first[tile + 1] - tiles.first[tile]
@@ -96,9 +96,8 @@ def render_tiles(
             x, y, z = tiles.unit[start + r]
             for c in range(3):
                 directions[r, c] = x * turn[0, c] + y * turn[1, c] + z * turn[2, c]
-            near_and_far[r] = limits[tile]
         begin(dom, origins, directions, middle, 0, count, rays)
-        narrow(dom, near_and_far, 0, count, rays)
+        narrow(dom, limits[tile, 0], limits[tile, 1], count, rays)
         _, evaluated = trace(net, dom, origins, directions, 0, count, per_ray, stop_below, False, samples, rays)
         total += evaluated
         for r in range(count):

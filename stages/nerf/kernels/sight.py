@@ -79,14 +79,13 @@ def tile_limits(
 
 
 @njit(nogil=True, fastmath=FASTMATH)
-def narrow(dom: Domain, limits: np.ndarray, first: int, count: int, rays: Rays) -> None:
-    """Hold rays first..first+count, which are at their start, to their limits (n, 2); samples stay where they were."""
+def narrow(dom: Domain, near: float, far: float, count: int, rays: Rays) -> None:
+    """Hold the packet's rays, which are at their start, between two distances; samples stay where they were."""
     step = np.float32(dom.step)
     for r in range(count):
-        near, far = limits[first + r, 0], min(rays.far[r], limits[first + r, 1])
-        if near >= far:
+        rays.far[r] = min(rays.far[r], far)
+        if near >= rays.far[r]:
             rays.alive[r] = False
             continue
-        rays.far[r] = far
         if near > rays.t[r]:
             rays.t[r] += step * np.ceil((near - rays.t[r]) / step)

@@ -139,6 +139,10 @@ def field(path: Path) -> Iterator[Finding]:
     about = found.metadata
     quality = "not measured" if about.psnr_db is None else f"{about.psnr_db:.1f} dB"
     yield Finding("field", "ok", f"{path}: {about.dataset_kind}, {len(about.cameras)} training views, {quality}")
+    if about.accuracy is not None:
+        from deploy.accuracy import in_words
+
+        yield Finding("field", "ok", in_words(about.accuracy))
     if found.descriptors is None:
         told = "it does not remember how its training views look: searches take longer, and estimate needs a guess"
         yield Finding("field", "note", told, "train it again")

@@ -38,6 +38,7 @@ from bus.messages import Stats
 from bus.replay import RecordingInfo
 from bus.topics import CORRESPONDENCES, ESTIMATE, GUESS, MATCHES, POSE, VIEW
 from stages.geometry import rotation_error_deg, translation_error
+from stages.tracking.scoring import deviations
 
 Outcome = Literal["finished", "lost", "dropped"]
 
@@ -66,7 +67,10 @@ class TruthKnown:
 
 @dataclass(frozen=True)
 class FrameResult:
-    """What became of a frame; `cam_from_object` is the pose measured, None where none was."""
+    """What became of a frame; `cam_from_object` is the pose measured, None where none was.
+
+    covariance: (6, 6) of the pose's left twist, where it is known.
+    """
 
     frame_id: int
     capture_ns: int
@@ -75,6 +79,7 @@ class FrameResult:
     state: str | None = None
     score: float = 0.0
     cam_from_object: np.ndarray | None = None
+    covariance: np.ndarray | None = None
     truth: TruthKnown | None = None
     sent_ns: int | None = None
     answered_ns: int | None = None
@@ -171,19 +176,20 @@ def rate_hz(results: Sequence[FrameResult]) -> float:
 
 
 def to_csv(results: Iterable[FrameResult]) -> bytes:
-    """A row for each frame."""
+    """A row for each frame; sigma_ are standard deviations of its pose, in field units and degrees."""
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(
         ["frame_id", "capture_ns", "outcome", "state", "score", "passes", "latency_ms", "rotation_error_deg"]
-        + ["translation_error"]
+        + ["translation_error", "sigma_translation", "sigma_rotation_deg"]
         + [f"cam_from_object_{row}{column}" for row in range(3) for column in range(4)]
     )
     for result in results:
         turn, shift = result.errors or ("", "")
+        sigmas = ("", "") if result.covariance is None else deviations(result.covariance)
         pose = [""] * 12 if result.cam_from_object is None else result.cam_from_object[:3].ravel().tolist()
         columns = [result.frame_id, result.capture_ns, result.outcome, result.state, result.score, result.passes]
-        writer.writerow([*columns, result.latency_ms, turn, shift, *pose])
+        writer.writerow([*columns, result.latency_ms, turn, shift, *sigmas, *pose])
     return text.getvalue().encode()
 
 

@@ -160,7 +160,7 @@ def _concluded(tried: Sequence[PoseFound], belief: Belief) -> PoseFound:
     first = tried[0]
     for found in reversed(tried):
         if found.ok and found.cam_from_object is belief.cam_from_object:
-            return replace(found, passes=len(tried))
+            return replace(found, covariance=belief.covariance, passes=len(tried))
     reason = Reason.IMPLAUSIBLE_POSE if first.ok else first.reason
     return PoseFound(reason, correspondences=first.correspondences, passes=len(tried), stage_ms=first.stage_ms)
 

@@ -110,8 +110,7 @@ def _training_camera(metadata: FieldMetadata, width: int, height: int) -> Camera
     """The first training view's camera at that size, None where the shape is another."""
     for view in metadata.cameras[:1]:
         if abs(view.width * height - view.height * width) <= _ASPECT_TOLERANCE * view.width * height:
-            camera = Camera(view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.distortion)
-            return camera.resized(width, height)
+            return view.camera.resized(width, height)
     return None
 
 

@@ -223,7 +223,7 @@ def _print(figures: dict[str, Any]) -> None:
     console, protocol = result_console(), figures["protocol"]
     least, most = protocol["angle_deg"]
     lines = [
-        f"{figures['pairs']} pairs (seeds {', '.join(map(str, figures['seeds']))}), lengths in: {figures['unit']}",
+        f"{figures['pairs']} pairs (seeds {in_short(figures['seeds'])}), lengths in: {figures['unit']}",
         f"{protocol['name']}: guesses turned by {least:g} to {most:g} degrees about the {protocol['turn_about']}"
         f" {'or' if protocol['in_turn'] else 'and'} shifted by up to {protocol['max_translation']:.3g}",
     ]
@@ -236,6 +236,14 @@ def _print(figures: dict[str, Any]) -> None:
         plain = f"RE {_gap(gap['re_deg'])}, TE {_gap(gap['te'])}"
         capped = f"capped: RE {_gap(gap['capped_re_deg'])}, TE {_gap(gap['capped_te'])}"
         console.print(f"{name} against {gap['than']}: {plain}; {capped}", highlight=False)
+
+
+def in_short(numbers: Sequence[int]) -> str:
+    """Numbers from the least to the greatest, where they are all of these."""
+    low, high = min(numbers), max(numbers)
+    if high > low + 1 and list(numbers) == list(range(low, high + 1)):
+        return f"{low} to {high}"
+    return ", ".join(map(str, numbers))
 
 
 def _table(methods: dict[str, Any]) -> Table:

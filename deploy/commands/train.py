@@ -4,23 +4,27 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+import msgspec
 import numpy as np
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from deploy.output import check_writable, progress_console, write_json
+from deploy.settings import Settings
 from stages.errors import WeightsError
 from stages.matching.core import MatchingConfig
 from stages.nerf.config import FieldConfig, TrainingConfig
 
 if TYPE_CHECKING:
+    from stages.nerf.field import Field
     from stages.nerf.from_dataset import TrainedField, TrainingReport
+    from stages.nerf.metadata import PoseAccuracy
 
 _LINE_EVERY_S = 30.0
 
@@ -32,8 +36,11 @@ class Options:
     Example: fieldpose train ../shared/data/lego --size 400 --minutes 5 --out out/lego.safetensors
 
     The kind of dataset is recognised from its folder: Blender/NeRF-synthetic, transforms.json (instant-ngp,
-    nerfstudio) or LLFF. Ctrl-C ends the training early and keeps what was learnt. The JSON file has: psnr_db (mean
-    over the held-out views, null without any), psnr_db_by_view, steps, seconds, interrupted, size_bytes.
+    nerfstudio) or LLFF. Ctrl-C ends the training early and keeps what was learnt. In the end some of the training
+    images are looked for in the field, which tells how exact poses are to be expected, and whether the dataset's own
+    are in order. The JSON file has: psnr_db (mean over the held-out views, null without any), psnr_db_by_view,
+    accuracy (images, found, rotation_deg and translation, medians, error_scale, how many times larger errors are than
+    an image shows; null where too few were found), steps, seconds, interrupted, size_bytes.
     """
 
     dataset: tyro.conf.Positional[Path]
@@ -56,6 +63,7 @@ class Options:
 
     def run(self) -> int:
         """Train, say how good the field is."""
+        from deploy.accuracy import in_words
         from stages.nerf.from_dataset import train_field
 
         check_writable(self.out, self.json)
@@ -64,12 +72,16 @@ class Options:
         began = time.monotonic()
         with _progress_bar() as report:
             trained = train_field(
-                self.dataset, self.out, self.size, holdout, training, self.model, report, self._remember
-            )
+                self.dataset, self.out, self.size, holdout, training, self.model, report, self._remember,
+                self._examine,
+            )  # fmt: skip
         figures = _figures(trained, self.out)
         write_json(self.json, figures)
         print(f"{self.out}: {_quality(trained)}; {figures['size_bytes'] / 1e6:.1f} MB, ", end="")
         print(f"{figures['steps']} steps in {figures['seconds']:.0f} s, all in {time.monotonic() - began:.0f} s")
+        accuracy, unit = trained.field.metadata.accuracy, trained.field.metadata.unit
+        if accuracy is not None:
+            print(f"from the training view next to it, {in_words(accuracy)} (lengths in: {unit})")
         return 0
 
     def _remember(self, images: Iterable[np.ndarray]) -> np.ndarray | None:
@@ -87,11 +99,28 @@ class Options:
         return remembered(describe(image) for image in images)
 
 
+    def _examine(self, field: Field, images: Sequence[np.ndarray]) -> PoseAccuracy | None:
+        """How well its own training images are found in it; None without weights, of which _remember has told."""
+        from deploy.accuracy import pose_accuracy
+        from stages.nerf.loading import make_renderer
+        from stages.tracking.views import training_views
+
+        renderer = make_renderer(field, self.training.threads)
+        try:
+            return pose_accuracy(
+                renderer, training_views(field), images, [view.camera for view in field.metadata.cameras],
+                replace(Settings(), matching=self.matching),
+            )  # fmt: skip
+        except WeightsError:
+            return None
+
+
 def _figures(trained: TrainedField, out: Path) -> dict[str, Any]:
     scores = trained.test_psnr_db
     return {
         "psnr_db": float(np.mean(scores)) if scores else None,
         "psnr_db_by_view": scores,
+        "accuracy": msgspec.to_builtins(trained.field.metadata.accuracy),
         "steps": trained.field.metadata.trained_steps,
         "seconds": trained.field.metadata.trained_seconds,
         "interrupted": trained.interrupted,
@@ -117,7 +146,7 @@ def _progress_bar() -> Iterator[Callable[[TrainingReport], None]]:
 
         def report(state: TrainingReport) -> None:
             nonlocal next_line
-            text = _in_words(state)
+            text = _step_in_words(state)
             bar.update(task, completed=state.progress.fraction, description=text)
             if not console.is_terminal and state.progress.seconds >= next_line:
                 next_line = state.progress.seconds + _LINE_EVERY_S
@@ -126,7 +155,7 @@ def _progress_bar() -> Iterator[Callable[[TrainingReport], None]]:
         yield report
 
 
-def _in_words(state: TrainingReport) -> str:
+def _step_in_words(state: TrainingReport) -> str:
     progress = state.progress
     loss = 10 ** (-progress.train_psnr_db / 10)
     held_out = "" if state.validation_psnr_db is None else f", held-out views {state.validation_psnr_db:.2f} dB"

@@ -29,7 +29,7 @@ from scipy.stats import chi2
 from deploy.evaluation.pairs import Pair
 from deploy.evaluation.surface import SHARE, Surface, add, add_s, area_under_curve
 from deploy.results import CLOSE, CLOSE_DEG
-from stages.geometry import inverse, log_se3, rotation_error_deg, translation_error
+from stages.geometry import mahalanobis_squared, rotation_error_deg, translation_error
 
 CAP_DEG, CAP = 4 * CLOSE_DEG, 4 * CLOSE
 """Where errors are capped for comparisons, in degrees and in units of the field: four times the limits."""
@@ -66,8 +66,7 @@ class Answer:
         """The error by the stated covariance of the left twist (6, 6); None without one."""
         if self.cam_from_object is None or self.covariance is None:
             return None
-        twist = log_se3(self.pair.truth @ inverse(self.cam_from_object))
-        return float(twist @ np.linalg.pinv(self.covariance) @ twist)
+        return mahalanobis_squared(self.cam_from_object, self.covariance, self.pair.truth)
 
 
 def tells_translations(answers: Sequence[Answer]) -> bool:

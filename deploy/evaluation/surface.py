@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from scipy.spatial.distance import pdist
 
 from stages.errors import DatasetError
-from stages.geometry import Camera, rays
+from stages.geometry import rays
 from stages.nerf.metadata import TrainingCamera
 from stages.nerf.rendering_api import RayRenderer
 
@@ -68,9 +68,8 @@ def surface_of(renderer: RayRenderer, cameras: Sequence[TrainingCamera], rng: np
 
 
 def _seen_by(renderer: RayRenderer, view: TrainingCamera) -> np.ndarray:
-    camera = Camera(view.width, view.height, view.fx, view.fy, view.cx, view.cy, view.distortion).undistorted()
+    camera, pose = view.camera.undistorted(), view.pose
     camera = camera.scaled(min(1.0, _SIZE / max(camera.width, camera.height)))
-    pose = np.reshape(view.cam_from_object, (4, 4))
     rendered = renderer.render_view(camera, pose)
     y, x = np.nonzero((rendered.opacity > 0.5) & (rendered.depth > 0))
     origins, directions = rays(camera, pose, np.stack([x, y], axis=1).astype(np.float32))

@@ -15,7 +15,7 @@ from stages.geometry.rigid import (
     rotation_about,
 )
 from stages.geometry.sampling import perturb
-from stages.geometry.uncertainty import twist_covariance
+from stages.geometry.uncertainty import mahalanobis_squared, twist_covariance
 
 __all__ = [
     "Camera",
@@ -27,6 +27,7 @@ __all__ = [
     "is_rigid",
     "log_se3",
     "look_at",
+    "mahalanobis_squared",
     "nearest_rigid",
     "perturb",
     "rays",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,7 +16,7 @@ from stages.nerf.config import FieldConfig, TrainingConfig
 from stages.nerf.datasets import Dataset, load_dataset
 from stages.nerf.datasets.images import over_background
 from stages.nerf.field import Field
-from stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
+from stages.nerf.metadata import FieldMetadata, PoseAccuracy, Space, TrainingCamera
 from stages.nerf.occupancy import finer
 from stages.nerf.raybank import View
 from stages.nerf.renderer import NumbaRenderer
@@ -105,10 +105,13 @@ def train_field(
     config: FieldConfig | None = None,
     report: Callable[[TrainingReport], None] = lambda _: None,
     remember: Callable[[Iterable[np.ndarray]], np.ndarray | None] = lambda images: None,
+    examine: Callable[[Field, Sequence[np.ndarray]], PoseAccuracy | None] = lambda field, images: None,
 ) -> TrainedField:
     """Train on a dataset's training images, measure on its held-out ones, and save; Ctrl-C ends the training early.
 
     remember: makes the field's descriptors of the training images, (h, w, 3) uint8, or None if that cannot be.
+    examine: finds out how well these are found in the field, or None if that cannot be; not where the training was
+    ended early.
     Raises DatasetError; nothing is written before the training is over.
     """
     training, config = training or TrainingConfig(), config or FieldConfig()
@@ -129,10 +132,13 @@ def train_field(
     )
     field.occupied = finer(field.occupied, trainer.densities, metadata.space.step)
     field.save(out)  # what comes after it takes a while
-    field.descriptors = remember(over_background(view.image, dataset.background) for view in views)
+    images = [over_background(view.image, dataset.background) for view in views]
+    field.descriptors = remember(images)
     scores = evaluate(NumbaRenderer(field, training.threads), held_out) if held_out and not interrupted else []
     if scores:
         field.metadata = replace_metadata(field.metadata, psnr_db=float(np.mean(scores)))
+    if not interrupted:
+        field.metadata = replace_metadata(field.metadata, accuracy=examine(field, images))
     field.save(out)
     return TrainedField(field, scores, interrupted)
 

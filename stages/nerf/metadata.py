@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import msgspec
+import numpy as np
 
+from stages.geometry import Camera
 from stages.nerf.config import FieldConfig
 
 FORMAT_VERSION = 1
@@ -38,6 +40,30 @@ class TrainingCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     distortion: tuple[float, float, float, float, float]
     cam_from_object: tuple[float, ...]
 
+    @property
+    def camera(self) -> Camera:
+        """Its camera. Raises StageError where the intrinsics make none."""
+        return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
+
+    @property
+    def pose(self) -> np.ndarray:
+        """cam_from_object (4, 4) float64."""
+        return np.reshape(np.array(self.cam_from_object, np.float64), (4, 4))
+
+
+class PoseAccuracy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How well poses of a field's own training images are found, each from the training view next to it.
+
+    Of `images` that many were `found`, with these medians of the errors. error_scale: how many times larger the errors
+    are than the covariances say.
+    """
+
+    images: int
+    found: int
+    rotation_deg: float
+    translation: float
+    error_scale: float
+
 
 class FieldMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Stored as JSON beside the arrays of a field."""
@@ -52,6 +78,7 @@ class FieldMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     metres_per_unit: float | None = None
     has_background: bool = True
     psnr_db: float | None = None
+    accuracy: PoseAccuracy | None = None
     trained_seconds: float = 0.0
     trained_steps: int = 0
     made_by: str = ""

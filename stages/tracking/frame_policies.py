@@ -10,6 +10,7 @@ import numpy as np
 
 from bus.messages import GuessReason, TrackingState
 from stages.geometry import perturb
+from stages.tracking.certainty import Certainty
 from stages.tracking.config import TrackingConfig
 from stages.tracking.distance import Limit
 from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
@@ -22,13 +23,13 @@ _TRUTHS_KEPT = 256
 
 @dataclass
 class _Trial:
-    """A frame in flight: the poses that have been tried, its guess first, and the newest believed result.
+    """A frame in flight: the poses that have been tried, its guess first, and what is believed so far.
 
     near: training views, those nearest to the guess first; None until they are asked for.
     """
 
     tried: list[np.ndarray]
-    found: PoseResult | None = None
+    found: Belief | None = None
     near: np.ndarray | None = None
 
 
@@ -51,6 +52,7 @@ class EachFramePolicy:
         self._config = config
         self._views = views
         self._scale = views.scale
+        self._certainty = Certainty(views.error_scale, self._scale)
         self._guesses = guesses
         self._settled = Limit(config.settled_deg, config.settled * self._scale)
         self._trials: dict[int, _Trial] = {}
@@ -71,8 +73,7 @@ class EachFramePolicy:
         trial, guess = self._trials[attempt.frame.frame_id], attempt.guess.cam_from_object
         quality, pose = self._quality(result), result.cam_from_object
         if pose is not None and quality >= self._config.score.usable:
-            if self._believes(attempt, result):
-                trial.found = result
+            trial.found = self._belief(attempt, result) or trial.found
             if attempt.passes < self._config.passes and not self._settled.holds(guess, pose):
                 return PoseGuess(GuessReason.NEXT_PASS, pose)
         if self._config.passes == 1 or trial.found is not None:
@@ -82,11 +83,7 @@ class EachFramePolicy:
     def conclude(self, attempt: Attempt, result: PoseResult) -> Belief:
         """The newest pose that was believed, TRACKING; LOST without one."""
         found = self._trials.pop(attempt.frame.frame_id).found
-        if self._believes(attempt, result):
-            found = result
-        if found is None:
-            return Belief(TrackingState.LOST, 0.0)
-        return Belief(TrackingState.TRACKING, self._quality(found), found.cam_from_object, found.covariance)
+        return self._belief(attempt, result) or found or Belief(TrackingState.LOST, 0.0)
 
     def missed(self, frame: FrameInfo) -> Belief:
         """Nothing is known of a frame that did not come back."""
@@ -95,6 +92,14 @@ class EachFramePolicy:
 
     def _quality(self, result: PoseResult) -> float:
         return score(result, self._config.score, self._scale)
+
+    def _belief(self, attempt: Attempt, result: PoseResult) -> Belief | None:
+        """TRACKING at the pose that was found; None if it is not believed."""
+        pose, guess = result.cam_from_object, attempt.guess.cam_from_object
+        if pose is None or not self._believes(attempt, result):
+            return None
+        covariance = self._certainty.of(result.covariance, guess, pose)
+        return Belief(TrackingState.TRACKING, self._quality(result), pose, covariance)
 
     def _believes(self, attempt: Attempt, result: PoseResult) -> bool:
         if self._config.passes == 1:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bus.messages import GuessReason, TrackingState
+from stages.tracking.certainty import Certainty
 from stages.tracking.config import TrackingConfig
 from stages.tracking.distance import Limit
 from stages.tracking.motion import MotionModel
@@ -33,6 +34,7 @@ class TrackPolicy:
         retrieved: RetrievedPoses | None = None,
     ) -> None:
         scale = self._scale = views.scale
+        self._certainty = Certainty(views.error_scale, scale)
         self._config = config
         self._start = start
         self._retrieved = retrieved or RetrievedPoses()
@@ -77,9 +79,9 @@ class TrackPolicy:
         """Believe the pose or not, and move on to the next state."""
         pose, capture_ns = self._usable(result), attempt.frame.capture_ns
         if pose is not None and self._plausible(attempt, pose, result):
-            return self._accept(capture_ns, result, pose, begins=not self._trust.tracked)
+            return self._accept(attempt, result, pose, begins=not self._trust.tracked)
         if pose is not None and self._confirms(capture_ns, pose):
-            return self._accept(capture_ns, result, pose, begins=True)
+            return self._accept(attempt, result, pose, begins=True)
         if attempt.guess.epoch == self._trust.epoch:
             self._reject(capture_ns, pose)
         return self._without_pose(attempt.frame)
@@ -144,11 +146,11 @@ class TrackPolicy:
         distance = (config.jump + config.jump_per_s * seconds) * self._scale
         return Limit(config.jump_deg + config.jump_deg_per_s * seconds, distance)
 
-    def _accept(self, capture_ns: int, result: PoseResult, pose: np.ndarray, begins: bool) -> Belief:
+    def _accept(self, attempt: Attempt, result: PoseResult, pose: np.ndarray, begins: bool) -> Belief:
         quality, was_tracked = self._quality(result), self._trust.tracked
         if begins:
             self._motion.reset()
-        self._motion.add(capture_ns, pose)
+        self._motion.add(attempt.frame.capture_ns, pose)
         self._unconfirmed = None
         if quality >= self._config.score.good:
             self._trust.good()
@@ -156,7 +158,8 @@ class TrackPolicy:
         else:
             self._trust.weak()
             self._prepare_relocalisation(was_tracked)
-        return Belief(self._trust.state, quality, pose, result.covariance)
+        covariance = self._certainty.of(result.covariance, attempt.guess.cam_from_object, pose)
+        return Belief(self._trust.state, quality, pose, covariance)
 
     def _reject(self, capture_ns: int, pose: np.ndarray | None) -> None:
         was_tracked = self._trust.tracked

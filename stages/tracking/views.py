@@ -18,12 +18,14 @@ class TrainingViews:
     """The views that a field was learnt from: names, cam_from_object (n, 4, 4), and how they look, if that is known.
 
     descriptors: (n, keypoints, 64) int8, as stages.retrieval makes them of images whose longer side is `size`.
+    error_scale: how many times larger the errors of poses found next to them are than the covariances say.
     """
 
     names: tuple[str, ...]
     cam_from_object: np.ndarray
     descriptors: np.ndarray | None = None
     size: int = DESCRIBED_SIZE
+    error_scale: float = 1.0
 
     @property
     def scale(self) -> float:
@@ -44,12 +46,14 @@ class TrainingViews:
 def training_views(field: Field) -> TrainingViews:
     """The training views that a field tells of."""
     cameras = field.metadata.cameras
-    poses = [np.reshape(camera.cam_from_object, (4, 4)) for camera in cameras]
+    poses = [camera.pose for camera in cameras]
     names = tuple(camera.name for camera in cameras)
     largest = max((max(camera.width, camera.height) for camera in cameras), default=DESCRIBED_SIZE)
+    accuracy = field.metadata.accuracy
     return TrainingViews(
-        names, np.array(poses, dtype=np.float64).reshape(-1, 4, 4), field.descriptors, min(largest, DESCRIBED_SIZE)
-    )
+        names, np.array(poses, dtype=np.float64).reshape(-1, 4, 4), field.descriptors, min(largest, DESCRIBED_SIZE),
+        1.0 if accuracy is None else accuracy.error_scale,
+    )  # fmt: skip
 
 
 def farthest_point_order(poses: np.ndarray, limit: Limit) -> list[int]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from deploy.cli import main
+from deploy.commands.evaluate import in_short
 from deploy.evaluation.pairs import PROTOCOLS, Pair, draw
 from deploy.evaluation.scores import Answer, curve, difference, score, share_of_solvable
 from deploy.scene import demo_file
@@ -229,3 +230,11 @@ def test_an_unknown_method_is_named(tmp_path: Path, capsys: pytest.CaptureFixtur
     field = demo_file("field.safetensors")
     assert main(["evaluate", str(field), str(field.parent), "--method", "guessing"]) == 2
     assert "method 'guessing': expected all, or one of one-step," in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("seeds", "told"),
+    [((0, 1, 2, 3), "0 to 3"), ((5,), "5"), ((1, 2), "1, 2"), ((0, 2, 3), "0, 2, 3"), ((2, 1, 0), "2, 1, 0")],
+)
+def test_seeds_are_told_in_short(seeds: tuple[int, ...], told: str) -> None:
+    assert in_short(seeds) == told

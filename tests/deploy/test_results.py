@@ -6,6 +6,7 @@ import copy
 import csv
 import io
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -69,7 +70,11 @@ def test_lost_messages_are_those_the_numbers_lack_or_only_the_command_has_heard(
 
 
 def test_the_rows_hold_pose_and_errors() -> None:
-    rows = list(csv.DictReader(io.StringIO(to_csv([result(3, 2.0, 0.0), result(4, None)]).decode())))
+    certain = replace(result(3, 2.0, 0.0), covariance=np.diag([1e-4, 0, 0, np.deg2rad(0.5) ** 2, 0, 0]))
+    rows = list(csv.DictReader(io.StringIO(to_csv([certain, result(4, None)]).decode())))
+    assert float(rows[0]["sigma_translation"]) == pytest.approx(0.01)
+    assert float(rows[0]["sigma_rotation_deg"]) == pytest.approx(0.5)
+    assert rows[1]["sigma_translation"] == ""
     assert float(rows[0]["rotation_error_deg"]) == pytest.approx(2.0, abs=1e-6)
     assert float(rows[0]["cam_from_object_00"]) == pytest.approx(np.cos(np.deg2rad(2)))
     assert rows[1]["cam_from_object_00"] == rows[1]["rotation_error_deg"] == ""

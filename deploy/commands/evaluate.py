@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from stages.nerf.field import Field
     from stages.nerf.rendering_api import RayRenderer
 
+_WRITTEN_EVERY_S = 60.0
+
 
 @dataclass(frozen=True)
 class Options:
@@ -35,13 +38,14 @@ class Options:
     nerf-synthetic: 5 images, 5 guesses each, turned by 10 to 40 degrees about the origin and shifted by up to 0.2;
     llff: up to 40 degrees and 0.1; occluded: the same, with things pasted over a part of the image; reach: alternately
     turned by up to 180 degrees or shifted by up to the object's diameter. The same seed gives the same pairs for
-    every method; slow ones get a part of them (--slow-pairs).
+    every method; slow ones get a part of them (--slow-pairs). Methods take turns, image by image, so that their times
+    can be compared.
 
-    The JSON file, written after each method, has: protocol, unit, pairs, seeds, covered, diameter, methods (name ->
-    pairs, share_re_below_5deg, share_te_below_0.05, share_both_below, share_ok, share_ok_right, share_of_solvable,
-    mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te, seconds_per_image, covariance, add),
-    differences (name -> than, and the mean and 95 % interval of how much larger its errors are than that method's,
-    also with errors capped at 20 degrees and 0.2, a missing pose being so wrong).
+    The JSON file, written each minute with what there is and in the end, has: protocol, unit, pairs, seeds, covered,
+    diameter, methods (name -> pairs, share_re_below_5deg, share_te_below_0.05, share_both_below, share_ok,
+    share_ok_right, share_of_solvable, mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te,
+    seconds_per_image, covariance, add), differences (name -> than, and the mean and 95 % interval of how much larger
+    its errors are than that method's, also with errors capped at 20 degrees and 0.2, a missing pose being so wrong).
     """
 
     field: tyro.conf.Positional[Path]
@@ -109,11 +113,15 @@ class Options:
             "covered": covered,
             "diameter": None if surface is None else surface.diameter,
         }
-        answers: dict[str, Sequence[Answer]] = {}
-        for name in names:
-            answers[name] = list(examination.answers(name, self.settings, self.slow_pairs))
-            figures = {**about, **_scores(answers, surface)}
-            write_json(self.json, figures)
+        answers: dict[str, list[Answer]] = {name: [] for name in names}
+        written = time.monotonic()
+        for name, answer in examination.answers(names, self.settings, self.slow_pairs):
+            answers[name].append(answer)
+            if self.json is not None and time.monotonic() - written > _WRITTEN_EVERY_S:
+                write_json(self.json, {**about, **_scores(answers, surface)})
+                written = time.monotonic()
+        figures = {**about, **_scores(answers, surface)}
+        write_json(self.json, figures)
         self._draw(answers, surface)
         _print(figures)
         _warn_of_training_images(field, dataset)
@@ -205,6 +213,7 @@ def _scores(answers: Mapping[str, Sequence[Answer]], surface: Surface | None) ->
     from deploy.evaluation.methods import METHODS
     from deploy.evaluation.scores import difference, score, share_of_solvable
 
+    answers = {name: given for name, given in answers.items() if given}
     first, *others = answers
     whole = {name: METHODS[name].ablates or first for name in others}
     than = {name: other if other in answers else first for name, other in whole.items()}

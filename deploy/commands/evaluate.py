@@ -258,7 +258,7 @@ def in_short(numbers: Sequence[int]) -> str:
 def _table(methods: dict[str, Any]) -> Table:
     table = Table()
     errors_and_time = ("RE mean", "median", "TE mean", "median", "s")
-    for column in ("method", "pairs", "< 5 deg", "< 0.05", "ok", "ok & right", *errors_and_time):
+    for column in ("method", "pairs", "< 5 deg", "< 0.05", "ok", "right of ok", *errors_and_time):
         table.add_column(column, justify="left" if column == "method" else "right")
     for name, row in methods.items():
         shares = ("share_re_below_5deg", "share_te_below_0.05", "share_ok", "share_ok_right")

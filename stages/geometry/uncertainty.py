@@ -20,20 +20,19 @@ def twist_covariance(
 ) -> np.ndarray:
     """Covariance (6, 6) of the left twist that minimises weighted squared residuals.
 
-    jacobian (n, k, 6) of k residuals of each of n pixels (n, 2), n > 0; weights (n,), 1 / variance up to a factor;
-    variance: of a residual of weight 1; shared: standard deviation of a cell's offset as a multiple of a typical
-    residual's; the image's longer side has eight cells. Directions that nothing determines have a huge variance.
+    jacobian (n, k, 6) of k residuals of each of n pixels (n, 2), n > 0; weights (n, k, k), their inverse covariances up
+    to a factor; variance: of a residual of weight 1; shared: variance of the offset that all residuals of a cell have;
+    the image's longer side has eight cells. Directions that nothing determines have a huge variance.
     """
-    weighted = weights[:, None, None] * jacobian
+    weighted = weights @ jacobian
     inverse = _inverse(np.tensordot(weighted, jacobian, axes=((0, 1), (0, 1))))
     places = np.floor(pixels * (_CELLS / longer_side)).astype(int)
     _, cells = np.unique(places, axis=0, return_inverse=True)
     cells = cells.ravel()
     sums = np.zeros((cells.max() + 1, *jacobian.shape[1:]))
     np.add.at(sums, cells, weighted)
-    typical = max(float((weights**2).sum() / max(weights.sum(), 1e-12)), 1e-12)
-    together = np.tensordot(sums, sums, axes=((0, 1), (0, 1))) * (shared**2 / typical)
-    return variance * (inverse + inverse @ together @ inverse)
+    together = np.tensordot(sums, sums, axes=((0, 1), (0, 1)))
+    return variance * inverse + shared * inverse @ together @ inverse
 
 
 def mahalanobis_squared(cam_from_object: np.ndarray, covariance: np.ndarray, truth: np.ndarray) -> float:

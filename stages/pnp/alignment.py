@@ -44,10 +44,14 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Placed:
-    """Points that were found in the frame: `index` (m,) of them, and their pixels (m, 2) float64."""
+    """Points that were found in the frame: `index` (m,) of them, their pixels (m, 2) float64, and how exact these are.
+
+    weights: (m, 2, 2), their inverse covariances up to a factor: an edge's patch tells nothing of where it is along it.
+    """
 
     index: np.ndarray
     pixels: np.ndarray
+    weights: np.ndarray
 
 
 class Aligner:
@@ -87,15 +91,18 @@ class Aligner:
         if most is not None:
             index = index[:: max(1, -(-len(index) // most))]
         places, similarity = np.empty((len(index), 2), np.float32), np.empty(len(index), np.float32)
+        spread = np.empty((len(index), 2, 2), np.float32)
         find_patches(
             self._view[level], self._frame[level], (self._pixels[index] * smaller).astype(np.float32), warps[index],
-            starts[index] * smaller, config.align_half, config.align_steps, places, similarity,
+            starts[index] * smaller, config.align_half, config.align_steps, places, similarity, spread,
         )  # fmt: skip
         places /= smaller
         inside = ((places >= 0) & (places <= (width - 1, height - 1))).all(axis=1)
         found = inside & (similarity > config.align_similarity)
         pixels = (places[found].astype(np.float64) + 0.5) / self._scale - 0.5
-        return Placed(index[found], pixels)
+        # In pixels of the view, of which the frame's are all the same multiple.
+        spread = spread[found].astype(np.float64) * 4**level
+        return Placed(index[found], pixels, np.linalg.inv(spread + config.align_floor_px**2 * np.eye(2)))
 
 
 def inverse_depth_slopes(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:

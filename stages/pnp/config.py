@@ -27,13 +27,13 @@ class PnpConfig:
     """inliers must extend at least this share of the image's longer side across their narrowest direction (std)"""
     max_rotation_std_deg: float = 5.0
     """a pose that its inliers leave less certain than this is none"""
-    max_translation_std: float = 0.025
+    max_translation_std: float = 0.018
     """nor is one whose translation is less certain than this share of the distance to the inliers"""
     confidence_power: float = 2.0
     """squared errors are weighted by the matches' confidence to this power; 0: all the same"""
-    shared_error: float = 0.85
+    shared_error: float = 0.6
     """how far neighbouring matches err together, as a multiple of the inliers' residuals; found on several scenes"""
-    shared_error_by_angle: float = 0.35
+    shared_error_by_angle: float = 0.25
     """what is added to it for each radian between the directions of view, divided by the share of inliers: features
     move on surfaces that are seen from elsewhere, and a small consensus holds matches that agree by chance"""
     align_levels: int = 3
@@ -45,6 +45,9 @@ class PnpConfig:
     """at most so many steps to find a patch"""
     align_similarity: float = 0.75
     """patches that correlate less are not found"""
+    align_floor_px: float = 0.02
+    """no patch is found more exactly, in pixels of the view; with little texture it is as much less exact, and in the
+    direction, as its grey values say"""
     align_px: float = 1.5
     """largest reprojection error of a point that was found, in pixels of the view"""
     align_spread: float = 0.63

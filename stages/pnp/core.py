@@ -15,7 +15,7 @@ from stages.errors import StageError
 from stages.geometry import Camera, camera_centre, is_rigid, twist_covariance, viewing_angles
 from stages.pnp.alignment import Aligner, Pictures
 from stages.pnp.config import PnpConfig
-from stages.pnp.least_squares import CONVERGED, PoseFit, distances_px, fit_pose
+from stages.pnp.least_squares import CONVERGED, PoseFit, alike_in_all_directions, distances_px, fit_pose
 
 __all__ = ["Pictures", "PnpConfig", "PnpResult", "solve", "warm_up"]
 
@@ -92,7 +92,9 @@ def solve(
     angles = viewing_angles(points[found.index], pose if seen_from is None else seen_from, pose)
     shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles) * count / len(found.index))
     residuals, jacobian = fit.errors
-    covariance = twist_covariance(jacobian, fit.weights, found.pixels, longer_side, fit.variance, shared)
+    covariance = twist_covariance(
+        jacobian, fit.weights, found.pixels, longer_side, fit.variance, shared**2 * fit.variance_px
+    )
     distance = float(np.median(np.linalg.norm(points[found.index] - camera_centre(pose), axis=1)))
     if not _plausible(covariance, found.pixels, longer_side, distance, config):
         return _failed("implausible_pose", count)
@@ -132,7 +134,7 @@ def _agreed(
     start = best_start(pixels, points, plain, threshold, config)
     if start is None:
         return None
-    fit, inliers = _polish(pixels, points, plain, start, weights, threshold, config)
+    fit, inliers = _polish(pixels, points, plain, start, alike_in_all_directions(weights), threshold, config)
     if fit is None or inliers.sum() < config.min_inlier_ratio * len(pixels):
         return None
     return _Consensus(fit, np.flatnonzero(inliers), pixels_in_frame[inliers])
@@ -176,12 +178,12 @@ def _aligned(
         last = i == len(rounds) - 1
         placed = aligner.place(found.fit.cam_from_object, level, None if last else _ENOUGH)
         try:
-            pixels, ones = _ideal(placed.pixels, camera), np.ones(len(placed.index))
+            pixels = _ideal(placed.pixels, camera)
         except StageError:  # a point was found where the lens has no inverse
             return None
         fit, inliers = _polish(
-            pixels, points[placed.index], camera.undistorted(), found.fit.cam_from_object, ones, spread_px, config,
-            CONVERGED if last else _NEAR_ENOUGH,
+            pixels, points[placed.index], camera.undistorted(), found.fit.cam_from_object, placed.weights, spread_px,
+            config, CONVERGED if last else _NEAR_ENOUGH,
         )  # fmt: skip
         if fit is None:
             return None

@@ -20,7 +20,7 @@ _MEDIAN_TO_SIGMA = 1.1774
 
 @dataclass(frozen=True)
 class PoseFit:
-    """cam_from_object (4, 4), and what it was fitted to: pixels (n, 2), points (n, 3), the camera, weights (n,)."""
+    """cam_from_object (4, 4), and what it was fitted to: pixels (n, 2), points (n, 3), camera, weights (n, 2, 2)."""
 
     cam_from_object: np.ndarray
     pixels: np.ndarray
@@ -35,12 +35,22 @@ class PoseFit:
 
     @property
     def variance(self) -> float:
-        """Of a residual of weight 1 as Huber's loss sees it; Huber, Robust Statistics (1981), section 7.6."""
-        length = np.sqrt(self.weights) * np.linalg.norm(self.errors[0], axis=1)
-        delta = huber_width(length)
-        freedom = max(2 * len(length) - 6, 1)
-        slope = np.where(length <= delta, 1.0, delta / (2 * np.maximum(length, 1e-12))).mean()
-        return float((np.minimum(length, delta) ** 2).sum() / freedom / slope**2)
+        """Of a residual of weight 1."""
+        residuals = self.errors[0]
+        return _huber_variance(np.sqrt(np.einsum("ni,nij,nj->n", residuals, self.weights, residuals)))
+
+    @property
+    def variance_px(self) -> float:
+        """Of a typical residual, in pixels."""
+        return _huber_variance(np.linalg.norm(self.errors[0], axis=1))
+
+
+def _huber_variance(lengths: np.ndarray) -> float:
+    """Of residuals of these lengths (n,) as Huber's loss sees them; Huber, Robust Statistics (1981), section 7.6."""
+    delta = huber_width(lengths)
+    freedom = max(2 * len(lengths) - 6, 1)
+    slope = np.where(lengths <= delta, 1.0, delta / (2 * np.maximum(lengths, 1e-12))).mean()
+    return float((np.minimum(lengths, delta) ** 2).sum() / freedom / slope**2)
 
 
 def fit_pose(
@@ -53,8 +63,9 @@ def fit_pose(
 ) -> PoseFit:
     """Minimise Huber's loss of the reprojection errors by Levenberg-Marquardt, from a pose near the minimum.
 
-    pixels (n, 2) of an undistorted camera, points (n, 3) in object coordinates, weights (n,) of squared errors;
-    converged: the length of a twist, in radians and shares of the points' distance, that is the last step.
+    pixels (n, 2) of an undistorted camera, points (n, 3) in object coordinates, weights (n, 2, 2), inverse covariances
+    of the pixels up to a factor; converged: the length of a twist, in radians and shares of the points' distance, that
+    is the last step.
     """
     pixels, points, weights = (np.ascontiguousarray(given, np.float64) for given in (pixels, points, weights))
     distance = np.linalg.norm(np.median(points, axis=0) @ cam_from_object[:3, :3].T + cam_from_object[:3, 3])
@@ -65,10 +76,16 @@ def fit_pose(
 
 def distances_px(pixels: np.ndarray, points: np.ndarray, camera: Camera, cam_from_object: np.ndarray) -> np.ndarray:
     """Lengths (n,) of the reprojection errors; infinite behind the camera. Arrays as for fit_pose."""
-    lengths = np.empty(len(points))
+    lengths, plain = np.empty(len(points)), alike_in_all_directions(np.ones(len(points)))
     pose = np.ascontiguousarray(cam_from_object, np.float64)
-    weighted_lengths(pixels, points, intrinsics_of(camera), pose, np.ones(len(points)), lengths)
+    weighted_lengths(pixels, points, intrinsics_of(camera), pose, plain, lengths)
     return lengths
+
+
+def alike_in_all_directions(weights: np.ndarray) -> np.ndarray:
+    """Weights (n,) as (n, 2, 2)."""
+    matrices: np.ndarray = weights[:, None, None] * np.eye(2)
+    return matrices
 
 
 def intrinsics_of(camera: Camera) -> np.ndarray:
@@ -92,7 +109,7 @@ def weighted_lengths(
     pixels: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray, weights: np.ndarray,
     out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Reprojection errors out (n,), each times the root of its weight; infinite behind the camera. All float64."""
+    """Lengths out (n,) of reprojection errors by their weights (n, 2, 2); infinite behind the camera. All float64."""
     fx, fy, cx, cy = intrinsics
     for i in range(points.shape[0]):
         u, v, z = ideal(pose, points[i])
@@ -100,7 +117,7 @@ def weighted_lengths(
             out[i] = np.inf
             continue
         x, y = fx * u + cx - pixels[i, 0], fy * v + cy - pixels[i, 1]
-        out[i] = math.sqrt(weights[i] * (x * x + y * y))
+        out[i] = math.sqrt(weights[i, 0, 0] * x * x + 2 * weights[i, 0, 1] * x * y + weights[i, 1, 1] * y * y)
 
 
 @njit(nogil=True, cache=True)
@@ -121,16 +138,19 @@ def normal_equations(
         if z <= 0:
             continue
         x, y = fx * u + cx - pixels[i, 0], fy * v + cy - pixels[i, 1]
-        length = math.sqrt(weights[i] * (x * x + y * y))
-        weight = weights[i] * (1.0 if length <= delta else delta / length)
+        xx, xy, yy = weights[i, 0, 0], weights[i, 0, 1], weights[i, 1, 1]
+        length = math.sqrt(xx * x * x + 2 * xy * x * y + yy * y * y)
+        robust = 1.0 if length <= delta else delta / length
+        xx, xy, yy = robust * xx, robust * xy, robust * yy
         rows[0, 0], rows[0, 1], rows[0, 2] = fx / z, 0.0, -fx * u / z
         rows[0, 3], rows[0, 4], rows[0, 5] = -fx * u * v, fx * (1 + u * u), -fx * v
         rows[1, 0], rows[1, 1], rows[1, 2] = 0.0, fy / z, -fy * v / z
         rows[1, 3], rows[1, 4], rows[1, 5] = -fy * (1 + v * v), fy * u * v, fy * u
         for a in range(6):
-            gradient[a] += weight * (rows[0, a] * x + rows[1, a] * y)
+            across, down = xx * rows[0, a] + xy * rows[1, a], xy * rows[0, a] + yy * rows[1, a]
+            gradient[a] += across * x + down * y
             for b in range(a + 1):
-                hessian[a, b] += weight * (rows[0, a] * rows[0, b] + rows[1, a] * rows[1, b])
+                hessian[a, b] += across * rows[0, b] + down * rows[1, b]
     for a in range(6):
         for b in range(a):
             hessian[b, a] = hessian[a, b]

@@ -104,21 +104,24 @@ def find_patches(
     steps: int,
     places: np.ndarray,
     similarity: np.ndarray,
+    spread: np.ndarray,
 ) -> None:
-    """Fill places (n, 2), where patches of the first image are in the second, and their similarity (n,).
+    """Fill places (n, 2), where patches of the first image are in the second, their similarity (n,) and spread.
 
     first, second: (h, w) float32.  centres (n, 2): pixels of the first, starts (n, 2): about where they are in the
     second.  first_from_second (n, 2, 2): how offsets from the one become offsets from the other.  A patch has
     2 half + 1 samples a side, a pixel of the second apart.  similarity: normalised correlation, weighted towards the
     middle, -1 to 1; -1 where the patch is too plain to be placed or the search leads away by three pixels or more
-    (the place is then the start). All float32.
+    (the place is then the start). spread (n, 2, 2): covariance of the place by what is left of the patch's grey values,
+    taken to be noise: along an edge it is large. All float32.
     """
     if min(first.shape[0], first.shape[1], second.shape[0], second.shape[1]) < 2:
-        places[:], similarity[:] = starts, -1
+        places[:], similarity[:], spread[:] = starts, -1, 0
         return
     side = 2 * half + 1
     count = side * side
     x_offset, y_offset, weight = _window(half)
+    independent = np.float32(1) / _product(weight, weight, np.ones_like(weight))
     patch, other = np.empty(count, np.float32), np.empty(count, np.float32)
     warped_x, warped_y = np.empty(count, np.float32), np.empty(count, np.float32)
     across, down = np.empty(count, np.float32), np.empty(count, np.float32)
@@ -126,6 +129,7 @@ def find_patches(
     for i in range(centres.shape[0]):
         places[i] = starts[i]
         similarity[i] = -1
+        spread[i] = 0
         a, b, c, d = first_from_second[i].flat
         for k in range(count):
             warped_x[k] = a * x_offset[k] + b * y_offset[k]
@@ -157,3 +161,7 @@ def find_patches(
         if (x - starts[i, 0]) ** 2 + (y - starts[i, 1]) ** 2 < _FARTHEST**2:
             places[i, 0], places[i, 1] = x, y
             similarity[i] = alike
+            # What is left of a patch has 2 (1 - alike) of its power, both being scaled to the same.
+            noise = 2 * (1 - alike) * contrast * contrast / (independent * determinant)
+            spread[i, 0, 0], spread[i, 1, 1] = noise * yy, noise * xx
+            spread[i, 0, 1] = spread[i, 1, 0] = -noise * xy

@@ -89,14 +89,21 @@ class Photometric:
     def covariance(
         self, sample: PixelSample, cam_from_object: np.ndarray, camera: Camera, shared: float
     ) -> np.ndarray:
-        """Covariance (6, 6) of the left twist of a pose that pixels like these were fitted by; see twist_covariance."""
+        """Covariance (6, 6) of the left twist of a pose that pixels like these were fitted by; see twist_covariance.
+
+        shared: how far neighbouring pixels err together, as a multiple of a typical residual.
+        """
         rendered, jacobian = self._render(sample, cam_from_object)
         residuals, weights = self._compare(sample, rendered)
         pull = weights[:, 0] * ((self._scale2 / (self._scale2 + residuals**2)) ** 2).mean(axis=1)
         variance = (pull[:, None] * residuals**2).sum() / max(pull.sum() * residuals.shape[1], 1e-12)
         pixels = camera.project(sample.directions)
         longer_side = max(camera.width, camera.height)
-        return twist_covariance(jacobian.astype(np.float64), pull, pixels, longer_side, float(variance), shared)
+        typical = max(float((pull**2).sum() / max(pull.sum(), 1e-12)), 1e-12)
+        return twist_covariance(
+            jacobian.astype(np.float64), pull[:, None, None] * np.eye(residuals.shape[1]), pixels, longer_side,
+            float(variance), shared**2 * float(variance) / typical,
+        )  # fmt: skip
 
     def _render(self, sample: PixelSample, cam_from_object: np.ndarray) -> tuple[RenderedRays, np.ndarray]:
         """Colours at a pose and their derivative (n, k, 6) by the left twist."""

@@ -174,7 +174,8 @@ def test_points_that_lie_anywhere_where_they_were_looked_for_were_found_by_chanc
     rng, count = np.random.default_rng(1), len(points)
     angle, radius = rng.uniform(0, 2 * np.pi, count), radius_px * np.sqrt(rng.random(count))
     scattered = in_frame(points) + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: Placed(np.arange(count), scattered))
+    placed = Placed(np.arange(count), scattered, np.tile(np.eye(2), (count, 1, 1)))
+    monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: placed)
     pixels = matched(points, 0.3, 0.5)
     plain, looked = solve(pixels, points, LENS), solve(pixels, points, LENS, pictures=pictures(view, frame))
     assert np.array_equal(pose_of(looked), pose_of(plain)) is not believed
@@ -207,7 +208,7 @@ def test_points_found_where_the_lens_has_no_inverse_leave_the_pose_of_the_matche
     folding = replace(LENS, distortion=(-1.2, 0.0, 0.0, 0.0, 0.0))
     inner = np.linalg.norm(in_frame(points) - 129.5, axis=1) < 60
     pixels = in_frame(points[inner], folding).astype(np.float32)
-    corner = Placed(np.arange(20), np.tile([[5.0, 5.0]], (20, 1)))
+    corner = Placed(np.arange(20), np.tile([[5.0, 5.0]], (20, 1)), np.tile(np.eye(2), (20, 1, 1)))
     monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: corner)
     with pytest.raises(StageError):
         folding.directions(corner.pixels)

@@ -15,11 +15,12 @@ def texture(rng: np.random.Generator, size: tuple[int, int] = (90, 110), blur: f
 
 
 def found(first: np.ndarray, second: np.ndarray, centres: np.ndarray, warps: np.ndarray, starts: np.ndarray,
-          half: int = 4, steps: int = 8) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+          half: int = 4, steps: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     places, similarity = np.empty((len(centres), 2), np.float32), np.empty(len(centres), np.float32)
+    spread = np.full((len(centres), 2, 2), np.nan, np.float32)
     given_as = [np.ascontiguousarray(array, np.float32) for array in (centres, warps, starts)]
-    find_patches(first, second, *given_as, half, steps, places, similarity)
-    return places, similarity
+    find_patches(first, second, *given_as, half, steps, places, similarity, spread)
+    return places, similarity, spread
 
 
 def bilinear(image: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -33,7 +34,7 @@ def bilinear(image: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def plain(first: np.ndarray, second: np.ndarray, centre: np.ndarray, warp: np.ndarray, start: np.ndarray,
-          half: int, steps: int) -> tuple[np.ndarray, float]:  # fmt: skip
+          half: int, steps: int) -> tuple[np.ndarray, float, np.ndarray]:  # fmt: skip
     """One patch, in float64 and by whole arrays."""
     first, second = first.astype(np.float64), second.astype(np.float64)
     line = np.arange(-half, half + 1)
@@ -49,7 +50,7 @@ def plain(first: np.ndarray, second: np.ndarray, centre: np.ndarray, warp: np.nd
     slopes = np.stack([across, down], axis=2).reshape(-1, 2)
     normal = slopes.T @ (weight.reshape(-1, 1) * slopes)
     if not np.linalg.eigvalsh(normal)[0] > 1e-5:
-        return start, -1.0
+        return start, -1.0, np.zeros((2, 2))
     contrast, place, alike = np.sqrt((weight * patch**2).sum()), np.array(start, np.float64), -1.0
     for _ in range(steps):
         other = centred(bilinear(second, place + grid))
@@ -60,7 +61,10 @@ def plain(first: np.ndarray, second: np.ndarray, centre: np.ndarray, warp: np.nd
         place -= np.clip(shift, -1, 1)
         if np.linalg.norm(shift) < 0.01:
             break
-    return (place, alike) if np.linalg.norm(place - start) < 3 else (start, -1.0)
+    if not np.linalg.norm(place - start) < 3:
+        return start, -1.0, np.zeros((2, 2))
+    left = other * contrast / there - patch
+    return place, alike, (weight * left**2).sum() * (weight**2).sum() * np.linalg.inv(normal)
 
 
 @settings(max_examples=40, deadline=None)
@@ -72,12 +76,13 @@ def test_the_kernel_does_what_its_plain_twin_does(seed: int, half: int, steps: i
     centres = rng.uniform(-3, 112, (12, 2)).astype(np.float32)
     starts = (centres + np.array([3, 5]) + rng.normal(0, 1, (12, 2))).astype(np.float32)
     warps = (np.eye(2) + rng.normal(0, 0.1, (12, 2, 2))).astype(np.float32)
-    places, similarity = found(first, second, centres, warps, starts, half, steps)
+    places, similarity, spread = found(first, second, centres, warps, starts, half, steps)
     for i in range(len(centres)):
-        place, alike = plain(first, second, centres[i], warps[i], starts[i], half, steps)
+        place, alike, doubt = plain(first, second, centres[i], warps[i], starts[i], half, steps)
         if abs(np.linalg.norm(place - starts[i]) - 3) > 0.1:  # on the limit either answer is right
             assert places[i] == pytest.approx(place, abs=0.02)
             assert similarity[i] == pytest.approx(alike, abs=0.01)
+            assert spread[i] == pytest.approx(doubt, rel=0.1, abs=0.01 * np.trace(doubt) + 1e-6)
 
 
 @settings(max_examples=25, deadline=None)
@@ -93,7 +98,7 @@ def test_a_warped_brightened_image_shows_its_patches_where_they_went(seed: int) 
     truth = middle + rng.uniform(-25, 25, (30, 2))
     centres = middle + (truth - middle) @ warp.T
     starts = truth + rng.uniform(-0.8, 0.8, truth.shape)
-    places, similarity = found(first, 0.6 * second + 0.2, centres, np.tile(warp, (30, 1, 1)), starts)
+    places, similarity, _ = found(first, 0.6 * second + 0.2, centres, np.tile(warp, (30, 1, 1)), starts)
     errors = np.linalg.norm(places - truth, axis=1)
     assert (similarity > 0.95).mean() > 0.9
     assert np.median(errors[similarity > 0.95]) < 0.06
@@ -104,7 +109,31 @@ def test_nothing_is_found_where_nothing_is_to_be_seen() -> None:
     ramp = np.tile(np.linspace(0, 1, 60, dtype=np.float32), (60, 1))
     places = np.array([[30.0, 30.0]], np.float32)
     for first, second in ((even, varied), (ramp, ramp)):
-        at, similarity = found(first, second, places, np.eye(2)[None], places)
+        at, similarity, spread = found(first, second, places, np.eye(2)[None], places)
+        assert not spread.any()
         assert similarity[0] == -1
         assert np.array_equal(at, places)
     assert found(varied, even, places, np.eye(2)[None], places)[1][0] < 0.1
+
+
+def test_the_spread_is_that_of_places_found_in_noise() -> None:
+    """Over many draws of noise on the second image alone; a quarter off at most, for what is sampled between pixels."""
+    rng = np.random.default_rng(3)
+    first = texture(rng, (60, 60), 2.0)
+    centre = np.array([[30.0, 29.0]], np.float32)
+    draws = [found(first, first + rng.normal(0, 0.01, first.shape).astype(np.float32), centre, np.eye(2)[None], centre)
+             for _ in range(400)]  # fmt: skip
+    places, spreads = np.array([places[0] for places, _, _ in draws]), np.array([spread[0] for _, _, spread in draws])
+    assert np.diag(np.cov(places.T)) == pytest.approx(np.diag(spreads.mean(axis=0)), rel=0.25)
+
+
+def test_along_an_edge_a_place_is_uncertain() -> None:
+    """Of a step that runs down the image with a little texture, across it is told well and down it is not."""
+    rng = np.random.default_rng(4)
+    edge = np.tile(np.where(np.arange(60) < 30, 0.2, 0.8), (60, 1)) + 0.2 * (texture(rng, (60, 60)) - 0.5)
+    first = cv2.GaussianBlur(edge.astype(np.float32), (0, 0), 1)
+    noisy = first + rng.normal(0, 0.003, first.shape).astype(np.float32)
+    centre = np.array([[30.0, 30.0]], np.float32)
+    _, similarity, spread = found(first, noisy, centre, np.eye(2)[None], centre)
+    assert similarity[0] > 0.9
+    assert spread[0, 1, 1] > 10 * spread[0, 0, 0]

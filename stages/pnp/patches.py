@@ -162,6 +162,6 @@ def find_patches(
             places[i, 0], places[i, 1] = x, y
             similarity[i] = alike
             # What is left of a patch has 2 (1 - alike) of its power, both being scaled to the same.
-            noise = 2 * (1 - alike) * contrast * contrast / (independent * determinant)
+            noise = 2 * max(1 - alike, np.float32(0)) * contrast * contrast / (independent * determinant)
             spread[i, 0, 0], spread[i, 1, 1] = noise * yy, noise * xx
             spread[i, 0, 1] = spread[i, 1, 0] = -noise * xy

@@ -127,6 +127,16 @@ def test_the_spread_is_that_of_places_found_in_noise() -> None:
     assert np.diag(np.cov(places.T)) == pytest.approx(np.diag(spreads.mean(axis=0)), rel=0.25)
 
 
+def test_in_the_same_image_no_place_is_less_than_certain() -> None:
+    """Rounding may make a correlation larger than 1."""
+    rng = np.random.default_rng(5)
+    image = texture(rng, (60, 60))
+    centres = rng.integers(10, 50, (200, 2)).astype(np.float32)
+    _, similarity, spread = found(image, image, centres, np.tile(np.eye(2), (200, 1, 1)), centres)
+    assert similarity.max() > 1 - 1e-6
+    assert np.linalg.eigvalsh(spread.astype(float)).min() > -1e-12
+
+
 def test_along_an_edge_a_place_is_uncertain() -> None:
     """Of a step that runs down the image with a little texture, across it is told well and down it is not."""
     rng = np.random.default_rng(4)

@@ -42,7 +42,8 @@ class ScoreConfig:
     usable: float = 0.2
     """A pose that scores less is not used."""
     good: float = 0.4
-    """What it takes to trust tracking again after it was limited or lost."""
+    """What it takes to trust tracking again after it was limited or lost, and to believe the pose of an image that
+    stands by itself where another pass has found it again."""
     sure: float = 0.9
     """What it takes to believe the pose of an image that stands by itself before another pass has found it again."""
 

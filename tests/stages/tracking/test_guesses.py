@@ -266,7 +266,7 @@ def test_forgotten_truths_do_not_matter_to_frames_in_flight() -> None:
 
 def test_a_weak_pose_is_believed_once_a_pass_has_found_it_again() -> None:
     policy, attempt = each_frame(passes=2)
-    weak = replace(result(on_sphere(20, 30)), inliers=14, correspondences=60)
+    weak = replace(result(on_sphere(20, 30)), inliers=20, correspondences=60)
     guess = policy.next_guess(attempt, weak)
     assert guess is not None
     assert guess.reason is GuessReason.NEXT_PASS
@@ -283,6 +283,20 @@ def test_a_weak_pose_is_believed_once_a_pass_has_found_it_again() -> None:
     assert again is not None
     assert again.reason is GuessReason.RELOCALISATION
     assert policy.conclude(attempt, elsewhere).cam_from_object is None
+
+
+def test_a_poor_pose_is_not_believed_even_where_it_is_found_again() -> None:
+    policy, first = each_frame(passes=2)
+    poor = replace(result(on_sphere(20, 30)), inliers=14, correspondences=60)
+    guess = policy.next_guess(first, poor)
+    assert guess is not None
+    assert guess.reason is GuessReason.NEXT_PASS
+    attempt = first.again(guess, 0)
+    found_again = replace(poor, cam_from_object=on_sphere(20.2, 30), pass_index=1)
+    elsewhere = policy.next_guess(attempt, found_again)
+    assert elsewhere is not None
+    assert elsewhere.reason is GuessReason.RELOCALISATION
+    assert policy.conclude(attempt, found_again).cam_from_object is None
 
 
 def test_a_single_pass_has_nothing_to_confirm_it() -> None:

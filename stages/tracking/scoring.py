@@ -28,8 +28,8 @@ def score(result: PoseResult, config: ScoreConfig, scale: float = 1.0) -> float:
 def believed(result: PoseResult, guess: np.ndarray, config: TrackingConfig, scale: float = 1.0) -> bool:
     """Whether the pose of an image that stands by itself is believed.
 
-    It is if it scores high, or if it lies where its pass began (`guess`) and scores well: seen from there, most of what a
-    right pose has lifted is found, while a wrong one has few inliers, and seldom leads to itself.
+    It is if it scores high, or if it lies where its pass began (`guess`) and scores well: from there most points of a
+    right pose are found, while a wrong one has few inliers, and seldom leads to itself.
     """
     quality, pose = score(result, config.score, scale), result.cam_from_object
     if pose is None or quality < config.score.good:

@@ -32,7 +32,7 @@ def pose_accuracy(
     views: TrainingViews,
     images: Sequence[np.ndarray],
     cameras: Sequence[Camera],
-    settings: Settings | None = None,
+    settings: Settings,
 ) -> PoseAccuracy | None:
     """Find some of the training images (h, w, 3) uint8, of these cameras, from the views next to them, unrefined.
 
@@ -40,7 +40,6 @@ def pose_accuracy(
     """
     if len(views.names) < 2:
         return None
-    settings = settings or Settings()
     settings = replace(
         settings,
         rendering=replace(settings.rendering, reuse_angle_deg=0.0),

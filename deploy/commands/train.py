@@ -59,7 +59,7 @@ class Options:
     training: TrainingConfig = dataclasses.field(default_factory=TrainingConfig)
     model: FieldConfig = dataclasses.field(default_factory=FieldConfig)
     matching: MatchingConfig = dataclasses.field(default_factory=MatchingConfig)
-    """Where XFeat's weights are, by which the field remembers its training views; nothing else of it is used."""
+    """By what the field is tried on its training images in the end; XFeat's weights also serve to remember these."""
 
     def run(self) -> int:
         """Train, say how good the field is."""
@@ -93,14 +93,12 @@ class Options:
         try:
             describe = describer(self.matching, DESCRIBED_SIZE)
         except WeightsError as error:
-            said = f"the field does not remember its training views, for retrieval: {error}"
-            progress_console().print(said, soft_wrap=True)
+            _say(f"the field does not remember its training views, for retrieval: {error}")
             return None
         return remembered(describe(image) for image in images)
 
-
     def _examine(self, field: Field, images: Sequence[np.ndarray]) -> PoseAccuracy | None:
-        """How well its own training images are found in it; None without weights, of which _remember has told."""
+        """How well its own training images are found in it; None, said on stderr, where the weights are missing."""
         from deploy.accuracy import pose_accuracy
         from stages.nerf.loading import make_renderer
         from stages.tracking.views import training_views
@@ -111,8 +109,13 @@ class Options:
                 renderer, training_views(field), images, [view.camera for view in field.metadata.cameras],
                 replace(Settings(), matching=self.matching),
             )  # fmt: skip
-        except WeightsError:
+        except WeightsError as error:
+            _say(f"the field is not tried on its training images, and its covariances are not scaled: {error}")
             return None
+
+
+def _say(text: str) -> None:
+    progress_console().print(text, soft_wrap=True)
 
 
 def _figures(trained: TrainedField, out: Path) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Cameras, rigid transforms, pose errors and random poses: what every stage shares."""
 
 from stages.geometry.cameras import Camera, rays
-from stages.geometry.errors import rotation_error_deg, translation_error, viewing_angles
+from stages.geometry.errors import mahalanobis_squared, rotation_error_deg, translation_error, viewing_angles
 from stages.geometry.rigid import (
     adjoint,
     camera_centre,
@@ -15,7 +15,7 @@ from stages.geometry.rigid import (
     rotation_about,
 )
 from stages.geometry.sampling import perturb
-from stages.geometry.uncertainty import mahalanobis_squared, twist_covariance
+from stages.geometry.uncertainty import twist_covariance
 
 __all__ = [
     "Camera",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.geometry.rigid import camera_centre
+from stages.geometry.rigid import camera_centre, inverse, log_se3
 
 
 def rotation_error_deg(cam_from_object_a: np.ndarray, cam_from_object_b: np.ndarray) -> float:
@@ -17,6 +17,12 @@ def rotation_error_deg(cam_from_object_a: np.ndarray, cam_from_object_b: np.ndar
 def translation_error(cam_from_object_a: np.ndarray, cam_from_object_b: np.ndarray) -> float:
     """The distance between the two camera centres, in object units."""
     return float(np.linalg.norm(camera_centre(cam_from_object_a) - camera_centre(cam_from_object_b)))
+
+
+def mahalanobis_squared(cam_from_object: np.ndarray, covariance: np.ndarray, truth: np.ndarray) -> float:
+    """The squared error of a pose (4, 4) by the covariance (6, 6) of its left twist: chi squared if that is true."""
+    twist = log_se3(truth @ inverse(cam_from_object))
+    return float(twist @ np.linalg.pinv(covariance) @ twist)
 
 
 def viewing_angles(points: np.ndarray, cam_from_object_a: np.ndarray, cam_from_object_b: np.ndarray) -> np.ndarray:

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.geometry.rigid import inverse, log_se3
-
 _CELLS = 8
 _LEAST = 1e-14
 
@@ -33,12 +31,6 @@ def twist_covariance(
     np.add.at(sums, cells, weighted)
     together = np.tensordot(sums, sums, axes=((0, 1), (0, 1)))
     return variance * inverse + shared * inverse @ together @ inverse
-
-
-def mahalanobis_squared(cam_from_object: np.ndarray, covariance: np.ndarray, truth: np.ndarray) -> float:
-    """The squared error of a pose (4, 4) by the covariance (6, 6) of its left twist: chi squared if that is true."""
-    twist = log_se3(truth @ inverse(cam_from_object))
-    return float(twist @ np.linalg.pinv(covariance) @ twist)
 
 
 def _inverse(hessian: np.ndarray) -> np.ndarray:

@@ -54,8 +54,8 @@ class TrainingCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class PoseAccuracy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How well poses of a field's own training images are found, each from the training view next to it.
 
-    Of `images` that many were `found`, with these medians of the errors. error_scale: how many times larger the errors
-    are than the covariances say.
+    Of `images` that many were `found`, with these medians of the errors. error_scale: how many times larger errors are
+    than covariances say, with an allowance for images that the field was not learnt from.
     """
 
     images: int

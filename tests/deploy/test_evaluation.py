@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from bus.messages import Reason
 from deploy.cli import main
 from deploy.commands.evaluate import in_short
+from deploy.evaluation.methods import Method
 from deploy.evaluation.pairs import PROTOCOLS, Pair, draw
+from deploy.evaluation.running import Examination
 from deploy.evaluation.scores import Answer, curve, difference, score, share_of_solvable
 from deploy.scene import demo_file
+from deploy.single import PoseFound
 from stages.geometry import camera_centre, exp_se3, look_at, rotation_about
 
 TRUTHS = [look_at((4 * np.cos(a), 4 * np.sin(a), 1.0), (0, 0, 0), (0, 0, 1)) for a in np.arange(7.0)]
@@ -238,3 +244,37 @@ def test_an_unknown_method_is_named(tmp_path: Path, capsys: pytest.CaptureFixtur
 )
 def test_seeds_are_told_in_short(seeds: tuple[int, ...], told: str) -> None:
     assert in_short(seeds) == told
+
+
+def test_methods_take_turns_image_by_image_and_what_there_is_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[dict[str, Any]] = []
+    turns, asked = Examination.answers, list[tuple[str, int]]()
+
+    class Nowhere:
+        def find(self, *question: object) -> PoseFound:
+            return PoseFound(Reason.NO_CONSENSUS)
+
+    def noted(*given: Any) -> Iterator[tuple[str, Answer]]:
+        for name, found in turns(*given):
+            asked.append((name, found.pair.image))
+            yield name, found
+
+    monkeypatch.setattr(Examination, "answers", noted)
+    methods = {"quick": Method(lambda *given: Nowhere()), "slow": Method(lambda *given: Nowhere(), slow=True)}
+    monkeypatch.setattr("deploy.evaluation.methods.METHODS", methods)
+    monkeypatch.setattr("deploy.evaluation.running.METHODS", methods)
+    monkeypatch.setattr("deploy.commands.evaluate._WRITTEN_EVERY_S", -1.0)
+    monkeypatch.setattr("deploy.commands.evaluate.write_json", lambda path, figures: written.append(figures))
+    field = demo_file("field.safetensors")
+    arguments = ["evaluate", field, field.parent, "--method", "all", "--seeds", 0, "--images", 2, "--poses", 2]
+    arguments += ["--size", 100, "--slow-pairs", 2, "--json", tmp_path / "scores.json"]
+    assert main([str(argument) for argument in arguments]) == 0
+    first, second = asked[0][1], asked[-1][1]
+    assert first != second
+    by_image = [("quick", first), ("quick", first), ("slow", first), ("quick", second), ("quick", second)]
+    assert asked == [*by_image, ("slow", second)]
+    assert list(written[0]["methods"]) == ["quick"]
+    assert written[0]["methods"]["quick"]["pairs"] == 1
+    assert [part["methods"].get("slow", {}).get("pairs", 0) for part in written] == [0, 0, 1, 1, 1, 2, 2]

@@ -61,7 +61,9 @@ def test_without_weights_a_field_is_learnt_that_remembers_nothing(
     arguments = ["train", str(tmp_path / "data"), "--out", str(out), "--size", "16", "--training.steps", "1"]
     assert main([*arguments, *SMALL]) == 0
     assert load_field(out).descriptors is None
-    assert "no weights xfeat.pt" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "does not remember its training views, for retrieval: no weights xfeat.pt" in said
+    assert "is not tried on its training images, and its covariances are not scaled: no weights xfeat.pt" in said
 
 
 @pytest.mark.parametrize("flags", [["--minutes", "0"], ["--minutes", "-1"], ["--training.steps", "0"]])

@@ -264,47 +264,43 @@ def test_forgotten_truths_do_not_matter_to_frames_in_flight() -> None:
     assert policy.next_guess(Attempt(FRAME, guess, 0), result(None)) is not None
 
 
-def test_a_weak_pose_is_believed_once_a_pass_has_found_it_again() -> None:
+def weak(inliers: int) -> PoseResult:
+    """A pose of which few of 60 lifted points were found."""
+    return replace(result(on_sphere(20, 30)), inliers=inliers, correspondences=60)
+
+
+def second_pass(first: PoseResult) -> tuple[EachFramePolicy, Attempt]:
+    """A policy whose first pass has found a weak pose."""
     policy, attempt = each_frame(passes=2)
-    weak = replace(result(on_sphere(20, 30)), inliers=20, correspondences=60)
-    guess = policy.next_guess(attempt, weak)
+    guess = policy.next_guess(attempt, first)
     assert guess is not None
     assert guess.reason is GuessReason.NEXT_PASS
-    attempt = attempt.again(guess, 0)
-    found_again = replace(weak, cam_from_object=on_sphere(20.2, 30), pass_index=1)
+    return policy, attempt.again(guess, 0)
+
+
+def test_a_weak_pose_is_believed_once_a_pass_has_found_it_again() -> None:
+    policy, attempt = second_pass(weak(20))
+    found_again = replace(weak(20), cam_from_object=on_sphere(20.2, 30), pass_index=1)
     assert policy.next_guess(attempt, found_again) is None
     assert policy.conclude(attempt, found_again).cam_from_object is found_again.cam_from_object
-    policy, first = each_frame(passes=2)
-    elsewhere = replace(weak, cam_from_object=on_sphere(60, 30), pass_index=1)
-    guess = policy.next_guess(first, weak)
-    assert guess is not None
-    attempt = first.again(guess, 0)
-    again = policy.next_guess(attempt, elsewhere)
-    assert again is not None
-    assert again.reason is GuessReason.RELOCALISATION
-    assert policy.conclude(attempt, elsewhere).cam_from_object is None
 
 
-def test_a_poor_pose_is_not_believed_even_where_it_is_found_again() -> None:
-    policy, first = each_frame(passes=2)
-    poor = replace(result(on_sphere(20, 30)), inliers=14, correspondences=60)
-    guess = policy.next_guess(first, poor)
+@pytest.mark.parametrize(("inliers", "azimuth"), [(20, 60), (14, 20.2)])
+def test_it_is_not_where_a_pass_leads_elsewhere_or_to_a_poor_one(inliers: int, azimuth: float) -> None:
+    policy, attempt = second_pass(weak(inliers))
+    again = replace(weak(inliers), cam_from_object=on_sphere(azimuth, 30), pass_index=1)
+    guess = policy.next_guess(attempt, again)
     assert guess is not None
-    assert guess.reason is GuessReason.NEXT_PASS
-    attempt = first.again(guess, 0)
-    found_again = replace(poor, cam_from_object=on_sphere(20.2, 30), pass_index=1)
-    elsewhere = policy.next_guess(attempt, found_again)
-    assert elsewhere is not None
-    assert elsewhere.reason is GuessReason.RELOCALISATION
-    assert policy.conclude(attempt, found_again).cam_from_object is None
+    assert guess.reason is GuessReason.RELOCALISATION
+    assert policy.conclude(attempt, again).cam_from_object is None
 
 
 def test_a_single_pass_has_nothing_to_confirm_it() -> None:
     policy, attempt = each_frame(passes=1)
-    weak = replace(result(on_sphere(20, 30)), inliers=14, correspondences=60)
+    found = weak(14)
     assert policy.next_guess(attempt, result(None)) is None
-    assert policy.next_guess(attempt, weak) is None
-    assert policy.conclude(attempt, weak).cam_from_object is weak.cam_from_object
+    assert policy.next_guess(attempt, found) is None
+    assert policy.conclude(attempt, found).cam_from_object is found.cam_from_object
 
 
 def test_nearest_first_lie_apart_from_the_guess_and_each_other() -> None:

@@ -130,7 +130,7 @@ class PoseFinder:
             "pnp", lambda: solve(pixels, points, camera, self._settings.pnp, confidence, seen_from, pictures)
         )
         if solved.cam_from_object is None:
-            return PoseFound(Reason(solved.reason), correspondences=len(pixels), stage_ms=clock.ms)
+            return PoseFound(Reason(solved.reason), correspondences=solved.correspondences, stage_ms=clock.ms)
         pose = solved.cam_from_object
         refined = clock.time(
             "refinement",
@@ -138,7 +138,7 @@ class PoseFinder:
                 self._renderer, image, camera, pose, solved.inliers_in_frame, rng, self._settings.refinement
             ),
         )
-        return _found(solved, refined, len(pixels), clock.ms)
+        return _found(solved, refined, clock.ms)
 
     def _lift(self, sourced: SourcedView, pixels: np.ndarray, rng: np.random.Generator) -> Lifted:
         view = sourced.view
@@ -176,13 +176,13 @@ class _Clock:
         return result
 
 
-def _found(solved: PnpResult, refined: RefinementResult, correspondences: int, ms: dict[str, float]) -> PoseFound:
+def _found(solved: PnpResult, refined: RefinementResult, ms: dict[str, float]) -> PoseFound:
     return PoseFound(
         reason=Reason.OK,
         cam_from_object=refined.cam_from_object,
         covariance=solved.covariance if refined.covariance is None else refined.covariance,
-        inliers=int(solved.inliers.sum()),
-        correspondences=correspondences,
+        inliers=len(solved.inliers_in_frame),
+        correspondences=solved.correspondences,
         residual_px=solved.residual_px,
         refined=refined.refined,
         loss_before=refined.loss_before,

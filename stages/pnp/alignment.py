@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -41,6 +42,11 @@ class Pictures:
     cam_from_object: np.ndarray
     frame: np.ndarray
 
+    @cached_property
+    def grey(self) -> np.ndarray:
+        """The view's grey values (h, w) uint8."""
+        return cv2.cvtColor(self.view, cv2.COLOR_RGB2GRAY)
+
 
 @dataclass(frozen=True)
 class Placed:
@@ -59,10 +65,9 @@ class Aligner:
 
     def __init__(self, pictures: Pictures, points: np.ndarray, camera: Camera, config: PnpConfig) -> None:
         self._view_camera, self._view_pose, self._config = pictures.camera, pictures.cam_from_object, config
-        view = cv2.cvtColor(pictures.view, cv2.COLOR_RGB2GRAY)
-        frame, self._camera = _shrunk(pictures.frame, camera, max(view.shape))
+        frame, self._camera = _shrunk(pictures.frame, camera, max(pictures.grey.shape))
         levels = max(config.align_levels, 1)
-        self._view, self._frame = _pyramid(view, levels), _pyramid(frame, levels)
+        self._view, self._frame = _pyramid(pictures.grey, levels), _pyramid(frame, levels)
         self._scale = np.array([self._camera.width / camera.width, self._camera.height / camera.height])
         in_view = points @ self._view_pose[:3, :3].T + self._view_pose[:3, 3]
         self._pixels = self._view_camera.project(in_view)

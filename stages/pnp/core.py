@@ -15,6 +15,7 @@ from stages.errors import StageError
 from stages.geometry import Camera, camera_centre, is_rigid, twist_covariance, viewing_angles
 from stages.pnp.alignment import Aligner, Pictures
 from stages.pnp.config import PnpConfig
+from stages.pnp.landmarks import landmarks
 from stages.pnp.least_squares import CONVERGED, PoseFit, alike_in_all_directions, distances_px, fit_pose
 
 __all__ = ["Pictures", "PnpConfig", "PnpResult", "solve", "warm_up"]
@@ -26,6 +27,8 @@ _ENOUGH = 300
 """So many points are enough to come nearer; all of them are looked for at the end."""
 _LEAST_ALIGNED = 0.3
 """Of the matches that agreed; where fewer points are found, the frame is blurred, say, and the matches know better."""
+_FEWER_ITERATIONS = 1000
+"""Of RANSAC, where a pose is known already and only a better one is looked for."""
 _LEAST_CONFIDENCE = 0.01
 _REFERENCE_SIDE_PX = 400
 
@@ -34,8 +37,9 @@ _REFERENCE_SIDE_PX = 400
 class PnpResult:
     """ok and a reason that is a value of bus.messages.Reason; the rest is None, or nothing, where not ok.
 
-    inliers: (n,) bool.  inliers_in_frame: (m, 2) float32, their pixels as matched, or as found in the frame since.
-    residual_px: root mean square over the inliers.  covariance: (6, 6) of the left twist (translation, rotation) of
+    inliers: (n,) bool, of the points given.  inliers_in_frame: (m, 2) float32, their pixels as matched, or as found in
+    the frame since, and there those of landmarks too.  correspondences: how many points these m were among.
+    residual_px: root mean square over the m.  covariance: (6, 6) of the left twist (translation, rotation) of
     cam_from_object, in the object's unit and radians.
     """
 
@@ -44,17 +48,33 @@ class PnpResult:
     cam_from_object: np.ndarray | None
     inliers: np.ndarray
     inliers_in_frame: np.ndarray
+    correspondences: int
     residual_px: float | None
     covariance: np.ndarray | None
 
 
 @dataclass(frozen=True)
 class _Consensus:
-    """A pose and what agrees on it: `index` (m,) of the correspondences, their pixels (m, 2) in the frame."""
+    """A pose and what agrees on it: `index` (m,) of the `looked_for` points, their pixels (m, 2) in the frame.
+
+    The first `matched` points are the correspondences', the others landmarks.
+    """
 
     fit: PoseFit
     index: np.ndarray
     pixels: np.ndarray
+    matched: int
+    looked_for: int
+
+    @property
+    def of_matched(self) -> int:
+        """How many correspondences agree."""
+        return int((self.index < self.matched).sum())
+
+    @property
+    def landmarks(self) -> int:
+        """How many landmarks agree."""
+        return len(self.index) - self.of_matched
 
 
 def solve(
@@ -70,9 +90,9 @@ def solve(
 
     confidence (n,), relative to each other, counts in the refinement and not in RANSAC. pictures: the view that gave
     the points, and the frame; with them all points are looked for anew near where RANSAC's pose puts them, whatever
-    they were matched with. seen_from (4, 4): where the view was, if there are none; the further it is from the pose
-    found, the less certain is that. The same input gives the same result. Never raises for data that hold no pose: the
-    result says why.
+    they were matched with, and landmarks of the view besides. seen_from (4, 4): where the view was, if there are none;
+    the further it is from the pose found, the less certain is that. The same input gives the same result. Never raises
+    for data that hold no pose: the result says why.
     """
     config = config or PnpConfig()
     count, longer_side = len(pixels_in_frame), max(camera.width, camera.height)
@@ -84,13 +104,14 @@ def solve(
         found = _agreed(pixels_in_frame, points, camera, weights, config)
     else:
         seen_from = pictures.cam_from_object
+        points = np.concatenate([points, landmarks(pictures, config.landmarks)])
         aligner = Aligner(pictures, points, camera, config)
         found = _confirmed(pixels_in_frame, points, camera, weights, aligner, config)
     if found is None:
         return _failed("no_consensus", count)
     fit, pose = found.fit, found.fit.cam_from_object
     angles = viewing_angles(points[found.index], pose if seen_from is None else seen_from, pose)
-    shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles) * count / len(found.index))
+    shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles))
     residuals, jacobian = fit.errors
     covariance = twist_covariance(
         jacobian, fit.weights, found.pixels, longer_side, fit.variance, shared**2 * fit.variance_px
@@ -99,9 +120,9 @@ def solve(
     if not _plausible(covariance, found.pixels, longer_side, distance, config):
         return _failed("implausible_pose", count)
     inliers, in_frame = np.zeros(count, bool), found.pixels.astype(np.float32)
-    inliers[found.index] = True
+    inliers[found.index[found.index < count]] = True
     rms = float(np.sqrt((residuals**2).sum(axis=1).mean()))
-    return PnpResult(True, "ok", pose, inliers, in_frame, rms, covariance)
+    return PnpResult(True, "ok", pose, inliers, in_frame, found.looked_for, rms, covariance)
 
 
 def warm_up(config: PnpConfig) -> None:
@@ -114,7 +135,7 @@ def warm_up(config: PnpConfig) -> None:
 
 
 def _failed(reason: str, count: int) -> PnpResult:
-    return PnpResult(False, reason, None, np.zeros(count, bool), np.zeros((0, 2), np.float32), None, None)
+    return PnpResult(False, reason, None, np.zeros(count, bool), np.zeros((0, 2), np.float32), count, None, None)
 
 
 def _weights(confidence: np.ndarray | None, count: int, config: PnpConfig) -> np.ndarray:
@@ -137,36 +158,47 @@ def _agreed(
     fit, inliers = _polish(pixels, points, plain, start, alike_in_all_directions(weights), threshold, config)
     if fit is None or inliers.sum() < config.min_inlier_ratio * len(pixels):
         return None
-    return _Consensus(fit, np.flatnonzero(inliers), pixels_in_frame[inliers])
+    return _Consensus(fit, np.flatnonzero(inliers), pixels_in_frame[inliers], len(points), len(points))
 
 
 def _confirmed(
     pixels_in_frame: np.ndarray, points: np.ndarray, camera: Camera, weights: np.ndarray, aligner: Aligner,
     config: PnpConfig,
 ) -> _Consensus | None:
-    """Of the poses that matches agree on, the first that enough points found in the frame bear out.
+    """Of the poses that matches agree on, the one at which the most points are found in the frame.
 
-    Where too few do, the matches that agreed so far are left out, for others to agree on another pose. If that
-    leads nowhere either, it is the first after all.
+    points: those of the matches, then landmarks, which no match has chosen. The first pose is it if many landmarks are
+    found. If not, the matches that agreed so far are left out, for others to agree on another pose, as they do where
+    the object has parts that look alike. If too little is found at any, it is the first after all.
     """
-    left, first, most, needed = np.arange(len(points)), None, 0, 0.0
-    enough = config.min_support * len(points)
-    fewer = replace(config, min_inlier_ratio=config.min_inlier_ratio * config.unconfirmed_share)
+    count = len(pixels_in_frame)
+    marks = len(points) - count
+    search = replace(config, min_inlier_ratio=config.min_inlier_ratio * config.unconfirmed_share)
+    left, best, first, most, needed = np.arange(count), None, None, 0, 0.0
     for _ in range(config.attempts):
-        agreed = _agreed(pixels_in_frame[left], points[left], camera, weights[left], fewer)
+        agreed = _agreed(pixels_in_frame[left], points[left], camera, weights[left], search)
         if agreed is None:
             break
-        agreed, others = replace(agreed, index=left[agreed.index]), np.delete(left, agreed.index)
-        found, most = _aligned(agreed, aligner, points, camera, config), max(most, len(agreed.index))
-        if found is not None and len(found.index) < _LEAST_ALIGNED * most:
+        others = np.delete(left, agreed.index)
+        agreed = replace(agreed, index=left[agreed.index], matched=count, looked_for=count)
+        found, most = _aligned(agreed, aligner, points, camera, config), max(most, agreed.of_matched)
+        if found is not None and not (
+            found.of_matched >= _LEAST_ALIGNED * most and found.landmarks >= int(config.min_landmarks * marks)
+        ):
             found = None
-        if found is not None and len(found.index) >= enough:
-            return found
-        if first is None:
+        if found is not None and found.of_matched >= config.min_support * count:
+            if best is None or len(found.index) > len(best.index):
+                best = found
+            if found.landmarks >= config.sure_landmarks * marks:
+                break
+            search = replace(search, iterations=min(search.iterations, _FEWER_ITERATIONS))
+        elif first is None:
             first, share = (agreed, config.min_unaligned) if found is None else (found, config.min_inlier_ratio)
-            needed = share * len(points)
+            needed = share * count
         left = others
-    return first if first is not None and len(first.index) >= needed else None
+    if best is not None:
+        return best
+    return first if first is not None and first.of_matched >= needed else None
 
 
 def _aligned(
@@ -187,7 +219,7 @@ def _aligned(
         )  # fmt: skip
         if fit is None:
             return None
-        found = _Consensus(fit, placed.index[inliers], placed.pixels[inliers])
+        found = _Consensus(fit, placed.index[inliers], placed.pixels[inliers], agreed.matched, len(points))
     rms = float(np.sqrt((found.fit.errors[0] ** 2).sum(axis=1).mean()))
     return found if rms <= config.align_spread * rounds[-1][1] else None
 

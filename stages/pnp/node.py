@@ -39,7 +39,8 @@ class PnpNode(JoinedHandler):
         yield ESTIMATE, Estimate(
             header=reply_header(given.header), ok=result.ok, reason=Reason(result.reason),
             cam_from_object=result.cam_from_object, covariance=result.covariance, camera=given.camera,
-            inliers_in_frame=result.inliers_in_frame, correspondences=int(kept.sum()), residual_px=result.residual_px,
+            inliers_in_frame=result.inliers_in_frame, correspondences=result.correspondences,
+            residual_px=result.residual_px,
         )  # fmt: skip
 
     def incomplete(self, joined: dict[Topic, Message], reason: Reason) -> Iterable[Output]:

@@ -99,8 +99,8 @@ def test_the_pose_is_better_by_pictures_than_by_matches(
     assert rotation_error_deg(pose_of(better), TRUTH) < 0.4 * rotation_error_deg(pose_of(plain), TRUTH)
     assert translation_error(pose_of(better), TRUTH) < 0.4 * translation_error(pose_of(plain), TRUTH)
     assert better.inliers.sum() > plain.inliers.sum()
-    found = in_frame(points)[better.inliers]
-    assert np.median(np.linalg.norm(better.inliers_in_frame - found, axis=1)) < 0.3
+    found = better.inliers_in_frame[: better.inliers.sum()]
+    assert np.median(np.linalg.norm(found - in_frame(points)[better.inliers], axis=1)) < 0.3
 
 
 def test_a_wrong_pose_is_told_by_how_little_is_found(
@@ -146,6 +146,54 @@ def test_another_pose_is_asked_for_where_matches_agree_on_a_wrong_one(
     assert rotation_error_deg(pose_of(solve(pixels, points, LENS, pictures=pictures(view, frame))), TRUTH) < 0.3
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_landmarks_hold_a_pose_that_is_matched_in_one_place_only(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray, seed: int
+) -> None:
+    close = np.argsort(np.linalg.norm(points - points[seed], axis=1))[:25]
+    pixels = matched(points, 0.0, 0.5, seed)[close]
+    without = solve(pixels, points[close], LENS, PnpConfig(landmarks=0), pictures=pictures(view, frame))
+    result = solve(pixels, points[close], LENS, pictures=pictures(view, frame))
+    assert translation_error(pose_of(result), TRUTH) < 0.6 * translation_error(pose_of(without), TRUTH)
+    assert result.inliers.shape == (25,)
+    assert len(without.inliers_in_frame) <= without.correspondences == 25
+    assert 25 < len(result.inliers_in_frame) < result.correspondences <= 125
+
+
+def test_parts_that_look_alike_are_told_apart_by_landmarks(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray
+) -> None:
+    """The box's top is there twice, and more matches agree on the wrong one, where their patches are found."""
+    wrong = exp_se3([0.35, 0.1, 0, 0, 0, 0]) @ TRUTH
+    here, there = in_frame(points), LENS.project(points @ wrong[:3, :3].T + wrong[:3, 3])
+    top, right = np.argsort(here[:, 1])[:60], np.argsort(here[:, 1])[-45:]
+    doubled = frame.copy()
+    for x, y, u, v in np.rint(np.hstack([here, there])).astype(int)[top]:
+        doubled[v - 9 : v + 10, u - 9 : u + 10] = frame[y - 9 : y + 10, x - 9 : x + 10]
+    pixels = np.random.default_rng(1).uniform(0, 259, here.shape).astype(np.float32)
+    pixels[top], pixels[right] = there[top], here[right]
+    given = pictures(view, doubled)
+    hasty = solve(pixels, points, LENS, PnpConfig(sure_landmarks=0.0), pictures=given)
+    assert rotation_error_deg(pose_of(hasty), wrong) < 1
+    assert translation_error(pose_of(hasty), wrong) < 0.05
+    assert translation_error(pose_of(solve(pixels, points, LENS, pictures=given)), TRUTH) < 0.01
+
+
+def test_no_pose_is_borne_out_where_too_few_landmarks_are_found(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray
+) -> None:
+    """All of the frame but the box's top is covered, and few matches are right: those there."""
+    here = in_frame(points)
+    top = np.argsort(here[:, 1])[:60]
+    covered = frame.copy()
+    covered[int(here[top, 1].max()) + 9 :] = 128
+    pixels = np.random.default_rng(2).uniform(0, 259, here.shape).astype(np.float32)
+    pixels[top] = here[top]
+    given, many = pictures(view, covered), PnpConfig(min_landmarks=0.6)
+    assert translation_error(pose_of(solve(pixels, points, LENS, pictures=given)), TRUTH) < 0.01
+    assert not solve(pixels, points, LENS, many, pictures=given).ok
+
+
 @pytest.mark.parametrize("frame_shade", [0, 255])
 def test_a_frame_without_anything_leaves_the_pose_of_the_matches(
     view: RenderedView, points: np.ndarray, frame_shade: int
@@ -177,7 +225,8 @@ def test_points_that_lie_anywhere_where_they_were_looked_for_were_found_by_chanc
     placed = Placed(np.arange(count), scattered, np.tile(np.eye(2), (count, 1, 1)))
     monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: placed)
     pixels = matched(points, 0.3, 0.5)
-    plain, looked = solve(pixels, points, LENS), solve(pixels, points, LENS, pictures=pictures(view, frame))
+    plain = solve(pixels, points, LENS)
+    looked = solve(pixels, points, LENS, PnpConfig(landmarks=0), pictures=pictures(view, frame))
     assert np.array_equal(pose_of(looked), pose_of(plain)) is not believed
 
 

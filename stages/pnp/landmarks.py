@@ -1,0 +1,52 @@
+"""Points of a view that are easily found again in a frame, whatever was matched.
+
+Source: Shi and Tomasi, Good features to track (1994).
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from stages.geometry import rays
+from stages.pnp.alignment import Pictures
+
+_LEAST_QUALITY = 0.01
+_APART_PX = 4
+_WINDOW_PX = 5
+_LARGEST_STEP = 0.1
+_AROUND = np.ones((3, 3), np.uint8)
+
+
+def landmarks(pictures: Pictures, most: int) -> np.ndarray:
+    """Points (n, 3) of the object, at most so many: those whose surroundings in the view have the most texture.
+
+    None is taken where the depth steps between neighbours by a tenth or more, as it does where the object ends.
+    """
+    pixels = _corners(pictures.grey, pictures.depth, most)
+    origins, directions = rays(pictures.camera, pictures.cam_from_object, pixels)
+    column, row = pixels.astype(int).T
+    points: np.ndarray = origins + pictures.depth[row, column, None] * directions
+    return points.astype(np.float64)
+
+
+def _corners(grey: np.ndarray, depth: np.ndarray, most: int) -> np.ndarray:
+    """Pixels (n, 2) float32, whole numbers, the best ones first."""
+    left, top, width, height = cv2.boundingRect((depth > 0).astype(np.uint8))
+    if most == 0 or min(width, height) < _WINDOW_PX:
+        return np.zeros((0, 2), np.float32)
+    shown = slice(top, top + height), slice(left, left + width)
+    found = cv2.goodFeaturesToTrack(
+        grey[shown], most, _LEAST_QUALITY, _APART_PX, mask=_continuous(depth[shown]), blockSize=_WINDOW_PX
+    )
+    if found is None:
+        return np.zeros((0, 2), np.float32)
+    pixels: np.ndarray = found[:, 0] + np.array([left, top], np.float32)
+    return pixels
+
+
+def _continuous(depth: np.ndarray) -> np.ndarray:
+    """1 where the eight pixels around (h, w) show the same surface, 0 elsewhere; uint8."""
+    nearest, farthest = cv2.erode(depth, _AROUND), cv2.dilate(depth, _AROUND)
+    continuous: np.ndarray = (nearest > 0) & (farthest - nearest < _LARGEST_STEP * farthest)
+    return continuous.astype(np.uint8)

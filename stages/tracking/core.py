@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from stages.tracking.config import TrackingConfig
+from stages.tracking.motion import NS_PER_MS
 from stages.tracking.policy import Attempt, Belief, FrameInfo, Policy, PoseGuess, PoseResult
 
-_NS_PER_MS = 1e6
 _LATENCY_SMOOTHING = 0.2
 
 
@@ -115,7 +115,7 @@ class Tracker:
 
     def on_tick(self, now_ns: int) -> list[Output]:
         """Give up what is past its deadline; call it often."""
-        late = [a for a in self._in_flight.values() if now_ns - a.sent_ns > self.deadline_ms * _NS_PER_MS]
+        late = [a for a in self._in_flight.values() if now_ns - a.sent_ns > self.deadline_ms * NS_PER_MS]
         reports: list[Output] = [self._give_up(attempt, now_ns) for attempt in late]
         return [*self._admit(now_ns), *reports, *self._turn_away(now_ns)]
 
@@ -141,7 +141,7 @@ class Tracker:
         if self._waiting is None or self._full():
             return []
         frame, since_ns = self._waiting
-        if now_ns - since_ns <= self._config.guess_wait_ms * _NS_PER_MS:
+        if now_ns - since_ns <= self._config.guess_wait_ms * NS_PER_MS:
             return []
         self._waiting = None
         self._dropped += 1
@@ -154,7 +154,7 @@ class Tracker:
         return self._report(attempt.frame, attempt.pass_index, self._policy.missed(attempt.frame))
 
     def _note_latency(self, latency_ns: int) -> None:
-        latency_ms = latency_ns / _NS_PER_MS
+        latency_ms = latency_ns / NS_PER_MS
         usual = latency_ms if self._latency_ms is None else self._latency_ms
         self._latency_ms = usual + _LATENCY_SMOOTHING * (latency_ms - usual)
 

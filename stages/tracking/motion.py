@@ -9,7 +9,7 @@ import numpy as np
 from stages.geometry import exp_se3, inverse, log_se3
 from stages.tracking.config import MotionConfig
 
-_NS_PER_MS = 1e6
+NS_PER_MS = 1e6
 _REMEMBERED = 16
 
 
@@ -57,7 +57,7 @@ class MotionModel:
 
     def within_horizon(self, capture_ns: int) -> bool:
         """Whether the newest pose is recent enough for its motion to be carried on to that time."""
-        return bool(self._poses) and capture_ns - self.newest_ns <= self._config.horizon_ms * _NS_PER_MS
+        return bool(self._poses) and capture_ns - self.newest_ns <= self._config.horizon_ms * NS_PER_MS
 
     def velocity(self) -> np.ndarray:
         """Left twist (6,) per second; zero with fewer than two poses near in time."""
@@ -76,9 +76,9 @@ class MotionModel:
         if len(self._times_ns) < 2:
             return None
         newest = self._times_ns[-1]
-        first = bisect.bisect_left(self._times_ns, newest - int(self._config.window_ms * _NS_PER_MS))
+        first = bisect.bisect_left(self._times_ns, newest - int(self._config.window_ms * NS_PER_MS))
         first = min(first, len(self._times_ns) - 2)
-        return first if newest - self._times_ns[first] <= self._config.horizon_ms * _NS_PER_MS else None
+        return first if newest - self._times_ns[first] <= self._config.horizon_ms * NS_PER_MS else None
 
     def _damped(self, ahead_s: float) -> float:
         decay_s = self._config.damping_ms * 1e-3

@@ -8,7 +8,7 @@ from bus.messages import GuessReason, TrackingState
 from stages.tracking.certainty import Certainty
 from stages.tracking.config import TrackingConfig
 from stages.tracking.distance import Limit
-from stages.tracking.motion import MotionModel
+from stages.tracking.motion import NS_PER_MS, MotionModel
 from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
 from stages.tracking.retrieved import RetrievedPoses
 from stages.tracking.scoring import score
@@ -16,7 +16,6 @@ from stages.tracking.trust import Trust
 from stages.tracking.views import Keyframes, Relocaliser, TrainingViews
 
 _NEAR_POSES = 4
-_NS_PER_MS = 1e6
 
 
 class TrackPolicy:
@@ -103,7 +102,7 @@ class TrackPolicy:
     def _search(self, frame: FrameInfo) -> np.ndarray:
         """A pose to try for a frame of which nothing is known."""
         photos = self._config.sequence == "photos"
-        within_ns = 0.0 if photos else self._config.motion.horizon_ms * _NS_PER_MS
+        within_ns = 0.0 if photos else self._config.motion.horizon_ms * NS_PER_MS
         return self._relocaliser.next(self._retrieved.near(frame, within_ns))
 
     def _retry(self, attempt: Attempt) -> PoseGuess | None:

@@ -123,6 +123,22 @@ def test_ctrl_c_keeps_what_was_learnt(tmp_path: Path) -> None:
     assert load_field(out).metadata.trained_steps >= 1
 
 
+def test_ctrl_c_while_the_field_is_tried_keeps_what_it_remembers(tmp_path: Path) -> None:
+    out = tmp_path / "field.safetensors"
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        from_dataset.train_field(
+            small_dataset(tmp_path / "data"), out, 24, training=TrainingConfig(steps=1), config=SMALL,
+            remember=lambda images: np.zeros((len(list(images)), 128, 64), np.int8), examine=interrupt,
+        )  # fmt: skip
+    field = load_field(out)
+    assert field.descriptors is not None
+    assert len(field.descriptors) == len(field.metadata.cameras)
+
+
 def test_a_bad_dataset_leaves_no_field(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no such folder"):
         from_dataset.train_field(tmp_path / "none", tmp_path / "field.safetensors")

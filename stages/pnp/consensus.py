@@ -1,0 +1,184 @@
+"""What correspondences agree on: a pose by RANSAC, and what the frame shows at it.
+
+Sources: Fischler and Bolles, Random sample consensus (1981); Chum, Matas and Kittler, Locally optimized RANSAC
+(2003), both as PoseLib has them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import poselib
+
+from stages.errors import StageError
+from stages.geometry import Camera, is_rigid
+from stages.pnp.alignment import Aligner
+from stages.pnp.config import PnpConfig
+from stages.pnp.least_squares import CONVERGED, PoseFit, alike_in_all_directions, distances_px, fit_pose
+
+MIN_POINTS = 4
+_ROUNDS = 3
+_NEAR_ENOUGH = 1e-3
+_ENOUGH = 300
+"""So many points are enough to come nearer; all of them are looked for at the end."""
+_LEAST_ALIGNED = 0.3
+"""Of the matches that agreed; where fewer points are found, the frame is blurred, say, and the matches know better."""
+_FEWER_ITERATIONS = 1000
+"""Of RANSAC, where a pose is known already and only a better one is looked for."""
+_REFERENCE_SIDE_PX = 400
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """A pose and what agrees on it: `index` (m,) of the `looked_for` points, their pixels (m, 2) in the frame.
+
+    The first `matched` points are the correspondences', the others landmarks.
+    """
+
+    fit: PoseFit
+    index: np.ndarray
+    pixels: np.ndarray
+    matched: int
+    looked_for: int
+
+    @property
+    def of_matched(self) -> int:
+        """How many correspondences agree."""
+        return int((self.index < self.matched).sum())
+
+    @property
+    def landmarks(self) -> int:
+        """How many landmarks agree."""
+        return len(self.index) - self.of_matched
+
+
+def agreed_pose(
+    pixels_in_frame: np.ndarray, points: np.ndarray, camera: Camera, weights: np.ndarray, config: PnpConfig
+) -> Consensus | None:
+    """The pose that most matches agree on, fitted to these; None where too few do."""
+    if len(points) < MIN_POINTS:
+        return None
+    pixels, plain = _ideal(pixels_in_frame, camera), camera.undistorted()
+    threshold = config.threshold_px * max(camera.width, camera.height) / _REFERENCE_SIDE_PX
+    start = _best_start(pixels, points, plain, threshold, config)
+    if start is None:
+        return None
+    fit, inliers = _polish(pixels, points, plain, start, alike_in_all_directions(weights), threshold, config)
+    if fit is None or inliers.sum() < config.min_inlier_ratio * len(pixels):
+        return None
+    return Consensus(fit, np.flatnonzero(inliers), pixels_in_frame[inliers], len(points), len(points))
+
+
+def confirmed_pose(
+    pixels_in_frame: np.ndarray, points: np.ndarray, camera: Camera, weights: np.ndarray, aligner: Aligner,
+    config: PnpConfig,
+) -> Consensus | None:
+    """Of the poses that matches agree on, the one at which the most points are found in the frame.
+
+    points: those of the matches, whose pixels (n, 2) and weights (n,) are given, then landmarks, which no match has
+    chosen. The first pose is it if many landmarks are found. If not, the matches that agreed so far are left out, for
+    others to agree on another pose, as they do where the object has parts that look alike. If too little is found at
+    any, it is the first after all.
+    """
+    count = len(pixels_in_frame)
+    marks = len(points) - count
+    search = replace(config, min_inlier_ratio=config.min_inlier_ratio * config.unconfirmed_share)
+    left, best, first, most, needed = np.arange(count), None, None, 0, 0.0
+    for _ in range(config.attempts):
+        agreed = agreed_pose(pixels_in_frame[left], points[left], camera, weights[left], search)
+        if agreed is None:
+            break
+        others = np.delete(left, agreed.index)
+        agreed = replace(agreed, index=left[agreed.index], matched=count, looked_for=count)
+        found, most = _aligned(agreed, aligner, points, camera, config), max(most, agreed.of_matched)
+        if found is not None and (
+            found.of_matched < _LEAST_ALIGNED * most or found.landmarks < int(config.min_landmarks * marks)
+        ):
+            found = None
+        if found is not None and found.of_matched >= config.min_support * count:
+            if best is None or len(found.index) > len(best.index):
+                best = found
+            if found.landmarks >= config.sure_landmarks * marks:
+                break
+            search = replace(search, iterations=min(search.iterations, _FEWER_ITERATIONS))
+        elif first is None:
+            first, share = (agreed, config.min_unaligned) if found is None else (found, config.min_inlier_ratio)
+            needed = share * count
+        left = others
+    if best is not None:
+        return best
+    return first if first is not None and first.of_matched >= needed else None
+
+
+def _aligned(
+    agreed: Consensus, aligner: Aligner, points: np.ndarray, camera: Camera, config: PnpConfig
+) -> Consensus | None:
+    """The pose by where points are found in the frame, from round to round; None where too few are, or by chance."""
+    found, rounds = agreed, list(aligner.rounds())
+    for i, (level, spread_px) in enumerate(rounds):
+        last = i == len(rounds) - 1
+        placed = aligner.place(found.fit.cam_from_object, level, None if last else _ENOUGH)
+        try:
+            pixels = _ideal(placed.pixels, camera)
+        except StageError:  # a point was found where the lens has no inverse
+            return None
+        fit, inliers = _polish(
+            pixels, points[placed.index], camera.undistorted(), found.fit.cam_from_object, placed.weights, spread_px,
+            config, CONVERGED if last else _NEAR_ENOUGH,
+        )  # fmt: skip
+        if fit is None:
+            return None
+        found = Consensus(fit, placed.index[inliers], placed.pixels[inliers], agreed.matched, len(points))
+    rms = float(np.sqrt((found.fit.errors[0] ** 2).sum(axis=1).mean()))
+    return found if rms <= config.align_spread * rounds[-1][1] else None
+
+
+def _ideal(pixels: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels (n, 2) float64 of the camera without distortion."""
+    return camera.directions(pixels)[:, :2].astype(np.float64) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+
+
+def _best_start(
+    pixels: np.ndarray, points: np.ndarray, camera: Camera, threshold: float, config: PnpConfig
+) -> np.ndarray | None:
+    """The pose that most correspondences agree on, or None.
+
+    pixels (n, 2) and points (n, 3) float64, the camera without distortion.
+    """
+    model = {"model": "PINHOLE", "width": camera.width, "height": camera.height}
+    intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
+    options = {
+        "max_reproj_error": threshold, "max_iterations": config.iterations,
+        "min_iterations": config.least_iterations, "success_prob": config.confidence, "seed": config.seed,
+    }  # fmt: skip
+    found, about = poselib.estimate_absolute_pose(
+        pixels, points, {**model, "params": intrinsics}, ransac_opt=options, bundle_opt={"max_iterations": 0}
+    )
+    pose = np.eye(4)
+    pose[:3] = found.Rt
+    return pose if about["num_inliers"] >= MIN_POINTS and is_rigid(pose) else None
+
+
+def _polish(
+    pixels: np.ndarray,
+    points: np.ndarray,
+    camera: Camera,
+    cam_from_object: np.ndarray,
+    weights: np.ndarray,
+    threshold: float,
+    config: PnpConfig,
+    converged: float = CONVERGED,
+) -> tuple[PoseFit | None, np.ndarray]:
+    """Fit the inliers and choose them anew by the fit, in turn; None where they become too few."""
+    pose, fit, inliers = cam_from_object, None, np.zeros(len(pixels), bool)
+    for _ in range(_ROUNDS):
+        agreeing = distances_px(pixels, points, camera, pose) <= threshold
+        if agreeing.sum() < max(config.min_inliers, MIN_POINTS):
+            return None, agreeing
+        if fit is not None and np.array_equal(agreeing, inliers):
+            break
+        inliers = agreeing
+        fit = fit_pose(pixels[inliers], points[inliers], camera, pose, weights[inliers], converged)
+        pose = fit.cam_from_object
+    return fit, inliers

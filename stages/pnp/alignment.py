@@ -53,11 +53,13 @@ class Placed:
     """Points that were found in the frame: `index` (m,) of them, their pixels (m, 2) float64, and how exact these are.
 
     weights: (m, 2, 2), their inverse covariances up to a factor: an edge's patch tells nothing of where it is along it.
+    seen: (n,) bool, which points the pose puts into the frame.
     """
 
     index: np.ndarray
     pixels: np.ndarray
     weights: np.ndarray
+    seen: np.ndarray
 
 
 class Aligner:
@@ -107,7 +109,7 @@ class Aligner:
         pixels = (places[found].astype(np.float64) + 0.5) / self._scale - 0.5
         # In pixels of the view, of which the frame's are all the same multiple.
         spread = spread[found].astype(np.float64) * 4**level
-        return Placed(index[found], pixels, np.linalg.inv(spread + config.align_floor_px**2 * np.eye(2)))
+        return Placed(index[found], pixels, np.linalg.inv(spread + config.align_floor_px**2 * np.eye(2)), seen)
 
 
 def inverse_depth_slopes(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:

@@ -24,6 +24,8 @@ _ENOUGH = 300
 """So many points are enough to come nearer; all of them are looked for at the end."""
 _LEAST_ALIGNED = 0.3
 """Of the matches that agreed; where fewer points are found, the frame is blurred, say, and the matches know better."""
+_LEAST_IN_FRAME = 1 / 3
+"""Of the landmarks: so many count as looked for even where a pose, maybe a wrong one, leaves fewer in the frame."""
 _FEWER_ITERATIONS = 1000
 """Of RANSAC, where a pose is known already and only a better one is looked for."""
 _REFERENCE_SIDE_PX = 400
@@ -31,20 +33,25 @@ _REFERENCE_SIDE_PX = 400
 
 @dataclass(frozen=True)
 class Consensus:
-    """A pose and what agrees on it: `index` (m,) of the `looked_for` points, their pixels (m, 2) in the frame.
+    """A pose and what agrees on it: `index` (m,) of the points, their pixels (m, 2) in the frame, distorted.
 
-    The first `matched` points are the correspondences', the others landmarks.
+    The first `matched` points are the matches', the others landmarks, of which `marks` were looked for.
     """
 
     fit: PoseFit
     index: np.ndarray
     pixels: np.ndarray
     matched: int
-    looked_for: int
+    marks: int
+
+    @property
+    def looked_for(self) -> int:
+        """How many points might have agreed."""
+        return self.matched + self.marks
 
     @property
     def of_matched(self) -> int:
-        """How many correspondences agree."""
+        """How many matches agree."""
         return int((self.index < self.matched).sum())
 
     @property
@@ -56,7 +63,11 @@ class Consensus:
 def agreed_pose(
     pixels_in_frame: np.ndarray, points: np.ndarray, camera: Camera, weights: np.ndarray, config: PnpConfig
 ) -> Consensus | None:
-    """The pose that most matches agree on, fitted to these; None where too few do."""
+    """The pose that most matches agree on, fitted to these; None where too few do.
+
+    pixels_in_frame (n, 2), distorted as the camera has them; points (n, 3) in the object; weights (n,). Raises
+    StageError for pixels where the lens has no inverse.
+    """
     if len(points) < MIN_POINTS:
         return None
     pixels, plain = _ideal(pixels_in_frame, camera), camera.undistorted()
@@ -67,7 +78,7 @@ def agreed_pose(
     fit, inliers = _polish(pixels, points, plain, start, alike_in_all_directions(weights), threshold, config)
     if fit is None or inliers.sum() < config.min_inlier_ratio * len(pixels):
         return None
-    return Consensus(fit, np.flatnonzero(inliers), pixels_in_frame[inliers], len(points), len(points))
+    return Consensus(fit, np.flatnonzero(inliers), pixels_in_frame[inliers], len(points), 0)
 
 
 def confirmed_pose(
@@ -79,7 +90,7 @@ def confirmed_pose(
     points: those of the matches, whose pixels (n, 2) and weights (n,) are given, then landmarks, which no match has
     chosen. The first pose is it if many landmarks are found. If not, the matches that agreed so far are left out, for
     others to agree on another pose, as they do where the object has parts that look alike. If too little is found at
-    any, it is the first after all.
+    each, it is the first after all, if enough matches agree on it, else None.
     """
     count = len(pixels_in_frame)
     marks = len(points) - count
@@ -90,16 +101,16 @@ def confirmed_pose(
         if agreed is None:
             break
         others = np.delete(left, agreed.index)
-        agreed = replace(agreed, index=left[agreed.index], matched=count, looked_for=count)
+        agreed = replace(agreed, index=left[agreed.index], matched=count, marks=marks)
         found, most = _aligned(agreed, aligner, points, camera, config), max(most, agreed.of_matched)
         if found is not None and (
-            found.of_matched < _LEAST_ALIGNED * most or found.landmarks < int(config.min_landmarks * marks)
+            found.of_matched < _LEAST_ALIGNED * most or found.landmarks < config.min_landmarks * found.marks
         ):
             found = None
         if found is not None and found.of_matched >= config.min_support * count:
             if best is None or len(found.index) > len(best.index):
                 best = found
-            if found.landmarks >= config.sure_landmarks * marks:
+            if found.landmarks >= config.sure_landmarks * found.marks:
                 break
             search = replace(search, iterations=min(search.iterations, _FEWER_ITERATIONS))
         elif first is None:
@@ -129,7 +140,8 @@ def _aligned(
         )  # fmt: skip
         if fit is None:
             return None
-        found = Consensus(fit, placed.index[inliers], placed.pixels[inliers], agreed.matched, len(points))
+        in_frame = max(int(placed.seen[agreed.matched :].sum()), int(_LEAST_IN_FRAME * agreed.marks))
+        found = Consensus(fit, placed.index[inliers], placed.pixels[inliers], agreed.matched, in_frame)
     rms = float(np.sqrt((found.fit.errors[0] ** 2).sum(axis=1).mean()))
     return found if rms <= config.align_spread * rounds[-1][1] else None
 

@@ -222,7 +222,7 @@ def test_points_that_lie_anywhere_where_they_were_looked_for_were_found_by_chanc
     rng, count = np.random.default_rng(1), len(points)
     angle, radius = rng.uniform(0, 2 * np.pi, count), radius_px * np.sqrt(rng.random(count))
     scattered = in_frame(points) + radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    placed = Placed(np.arange(count), scattered, np.tile(np.eye(2), (count, 1, 1)))
+    placed = Placed(np.arange(count), scattered, np.tile(np.eye(2), (count, 1, 1)), np.ones(count, bool))
     monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: placed)
     pixels = matched(points, 0.3, 0.5)
     plain = solve(pixels, points, LENS)
@@ -250,6 +250,26 @@ def test_nothing_is_found_beyond_the_frame(view: RenderedView, frame: np.ndarray
         assert np.all((placed.pixels >= -0.5) & (placed.pixels <= 259.5))
 
 
+def test_landmarks_outside_the_frame_are_not_missed(view: RenderedView, frame: np.ndarray, points: np.ndarray) -> None:
+    """The frame is the left part of the camera's image."""
+    here = in_frame(points)
+    left = here[:, 0] < 118
+    narrow = replace(LENS, width=120)
+    cut = solve(here[left].astype(np.float32), points[left], narrow, pictures=pictures(view, frame[:, :120]))
+    assert translation_error(pose_of(cut), TRUTH) < 0.01
+    assert len(points[left]) + 33 <= cut.correspondences < len(points[left]) + 70
+
+
+def test_a_pose_that_landmarks_do_not_bear_out_says_how_many_points_were_looked_for(
+    scene: AnalyticScene, view: RenderedView, points: np.ndarray
+) -> None:
+    """So that it does not pass for one that all points agree on."""
+    elsewhere = photograph(scene, LENS, viewpoint(200.0, 15.0))
+    believed = solve(matched(points, 0.0, 1.0), points, LENS, pictures=pictures(view, elsewhere))
+    assert believed.ok
+    assert believed.correspondences == len(points) + 100
+
+
 def test_points_found_where_the_lens_has_no_inverse_leave_the_pose_of_the_matches(
     view: RenderedView, frame: np.ndarray, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -257,7 +277,7 @@ def test_points_found_where_the_lens_has_no_inverse_leave_the_pose_of_the_matche
     folding = replace(LENS, distortion=(-1.2, 0.0, 0.0, 0.0, 0.0))
     inner = np.linalg.norm(in_frame(points) - 129.5, axis=1) < 60
     pixels = in_frame(points[inner], folding).astype(np.float32)
-    corner = Placed(np.arange(20), np.tile([[5.0, 5.0]], (20, 1)), np.tile(np.eye(2), (20, 1, 1)))
+    corner = Placed(np.arange(20), np.tile([[5.0, 5.0]], (20, 1)), np.tile(np.eye(2), (20, 1, 1)), np.ones(20, bool))
     monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: corner)
     with pytest.raises(StageError):
         folding.directions(corner.pixels)

@@ -242,7 +242,10 @@ class Correspondences(Message, kw_only=True):
 
 
 class Estimate(Message, kw_only=True):
-    """The pose of one PnP; the covariance is of a left twist (translation, rotation) in the camera frame."""
+    """The pose of one PnP; the covariance is of a left twist (translation, rotation) in the camera frame.
+
+    correspondences: how many points the inliers were among, landmarks of the view that were looked for included.
+    """
 
     ok: bool
     reason: Reason

@@ -68,9 +68,22 @@ class Camera:
 
         StageError where the distortion has no inverse (it folds the image over itself at that pixel).
         """
-        distorted = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
-        ideal = self._undistort(distorted) if self.is_distorted else distorted
+        ideal, usable = self._ideal(pixels)
+        if not usable.all():
+            worst = np.asarray(pixels)[np.argmin(usable)]
+            raise StageError(
+                f"the distortion {self.distortion} has no inverse at pixel ({worst[0]:.1f}, {worst[1]:.1f});"
+                " recalibrate the camera or crop the image to where the model is valid"
+            )
         return np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1).astype(np.float32)
+
+    def without_distortion(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where pixels (n, 2) are in the image of the undistorted camera, (n, 2) float64, and which (n,) are at all.
+
+        Those are not where the distortion has no inverse.
+        """
+        ideal, usable = self._ideal(pixels)
+        return ideal * (self.fx, self.fy) + (self.cx, self.cy), usable
 
     def project(self, points_in_cam: np.ndarray) -> np.ndarray:
         """Pixels (n, 2) float64, with distortion, of points (n, 3) in the camera frame; NaN where z <= 0."""
@@ -81,11 +94,14 @@ class Camera:
             ideal = distort(ideal, self.distortion)[0]
         return ideal * (self.fx, self.fy) + (self.cx, self.cy)
 
-    def _undistort(self, distorted: np.ndarray) -> np.ndarray:
-        """Invert the distortion of normalised image points (n, 2) by Newton's method.
+    def _ideal(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Normalised image points (n, 2) of pixels, and whether (n,) they were found, by Newton's method.
 
         Solutions where the derivative is not positive lie beyond the fold of the image and are none.
         """
+        distorted = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+        if not self.is_distorted:
+            return distorted, np.ones(len(distorted), bool)
         ideal = distorted.copy()
         tolerance = _INVERSE_TOLERANCE_PX / max(self.fx, self.fy)
         for _ in range(_NEWTON_STEPS):
@@ -93,15 +109,11 @@ class Camera:
             residual = predicted - distorted
             determinant = jacobian[:, 0, 0] * jacobian[:, 1, 1] - jacobian[:, 0, 1] * jacobian[:, 1, 0]
             folded = (determinant <= 0) | (jacobian[:, 0, 0] + jacobian[:, 1, 1] <= 0)
-            failed = folded | (np.abs(residual) >= tolerance).any(axis=1)
-            if not failed.any():
-                return ideal
+            usable = ~folded & (np.abs(residual) < tolerance).all(axis=1)
+            if usable.all():
+                break
             ideal -= _solve_2x2(jacobian, determinant, residual)
-        worst = distorted[np.argmax(failed)] * (self.fx, self.fy) + (self.cx, self.cy)
-        raise StageError(
-            f"the distortion {self.distortion} has no inverse at pixel ({worst[0]:.1f}, {worst[1]:.1f});"
-            " recalibrate the camera or crop the image to where the model is valid"
-        )
+        return ideal, usable
 
 
 def distort(ideal: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:

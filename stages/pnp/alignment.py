@@ -1,9 +1,9 @@
-"""Placing lifted points in the frame by comparing the view with it, once the pose is nearly known.
+"""Placing points of the view in the frame by comparing the two, once the pose is nearly known.
 
 Features move on surfaces that are seen from elsewhere, and many are matched wrongly. A pose that RANSAC has found tells
-where every lifted point must be and how its surroundings are warped there, so that the patch around it in the view can
-be looked for in the frame: coarsely first, then to a fraction of a pixel. What is found gives a better pose, and the
-share that is found tells whether the pose is right at all.
+where every point of the view must be, matched or a landmark, and how its surroundings are warped there, so that the
+patch around it in the view can be looked for in the frame: coarsely first, then to a fraction of a pixel. What is found
+gives a better pose, and the share that is found tells whether the pose is right at all.
 """
 
 from __future__ import annotations

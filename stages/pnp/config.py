@@ -14,7 +14,7 @@ class PnpConfig:
     threshold_px: float = 3.0
     """largest reprojection error of an inlier where the image is 400 pixels long; it grows with the image"""
     iterations: int = 5000
-    """at most so many samples of three points"""
+    """at most so many samples of three points; 1000 where a better pose than one found is looked for"""
     confidence: float = 0.999
     """RANSAC stops when a better pose would have been seen with this probability"""
     least_iterations: int = 50
@@ -79,3 +79,6 @@ class PnpConfig:
         for name, value in least.items():
             if getattr(self, name) < value:
                 raise ConfigError(f"pnp: {name} is {getattr(self, name)}, but must be at least {value}")
+        for name in ("min_inlier_ratio", "min_unaligned", "min_support", "min_landmarks", "sure_landmarks"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"pnp: {name} is {getattr(self, name)}, but is a share, from 0 to 1")

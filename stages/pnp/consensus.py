@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import poselib
 
-from stages.errors import StageError
 from stages.geometry import Camera, is_rigid
 from stages.pnp.alignment import Aligner
 from stages.pnp.config import PnpConfig
@@ -65,20 +64,23 @@ def agreed_pose(
 ) -> Consensus | None:
     """The pose that most matches agree on, fitted to these; None where too few do.
 
-    pixels_in_frame (n, 2), distorted as the camera has them; points (n, 3) in the object; weights (n,). Raises
-    StageError for pixels where the lens has no inverse.
+    pixels_in_frame (n, 2), distorted as the camera has them, where those without an inverse agree on nothing; points
+    (n, 3) in the object; weights (n,).
     """
-    if len(points) < MIN_POINTS:
+    pixels, usable = camera.without_distortion(pixels_in_frame)
+    index, plain = np.flatnonzero(usable), camera.undistorted()
+    if len(index) < MIN_POINTS:
         return None
-    pixels, plain = _ideal(pixels_in_frame, camera), camera.undistorted()
+    pixels, alike = pixels[index], alike_in_all_directions(weights[index])
     threshold = config.threshold_px * max(camera.width, camera.height) / _REFERENCE_SIDE_PX
-    start = _best_start(pixels, points, plain, threshold, config)
+    start = _best_start(pixels, points[index], plain, threshold, config)
     if start is None:
         return None
-    fit, inliers = _polish(pixels, points, plain, start, alike_in_all_directions(weights), threshold, config)
-    if fit is None or inliers.sum() < config.min_inlier_ratio * len(pixels):
+    fit, inliers = _polish(pixels, points[index], plain, start, alike, threshold, config)
+    if fit is None or inliers.sum() < config.min_inlier_ratio * len(points):
         return None
-    return Consensus(fit, np.flatnonzero(inliers), pixels_in_frame[inliers], len(points), 0)
+    index = index[inliers]
+    return Consensus(fit, index, pixels_in_frame[index], len(points), 0)
 
 
 def confirmed_pose(
@@ -130,25 +132,18 @@ def _aligned(
     for i, (level, spread_px) in enumerate(rounds):
         last = i == len(rounds) - 1
         placed = aligner.place(found.fit.cam_from_object, level, None if last else _ENOUGH)
-        try:
-            pixels = _ideal(placed.pixels, camera)
-        except StageError:  # a point was found where the lens has no inverse
-            return None
+        pixels, usable = camera.without_distortion(placed.pixels)  # a search may end where the lens has no inverse
+        index, pixels = placed.index[usable], pixels[usable]
         fit, inliers = _polish(
-            pixels, points[placed.index], camera.undistorted(), found.fit.cam_from_object, placed.weights, spread_px,
+            pixels, points[index], camera.undistorted(), found.fit.cam_from_object, placed.weights[usable], spread_px,
             config, CONVERGED if last else _NEAR_ENOUGH,
         )  # fmt: skip
         if fit is None:
             return None
         in_frame = max(int(placed.seen[agreed.matched :].sum()), int(_LEAST_IN_FRAME * agreed.marks))
-        found = Consensus(fit, placed.index[inliers], placed.pixels[inliers], agreed.matched, in_frame)
+        found = Consensus(fit, index[inliers], placed.pixels[usable][inliers], agreed.matched, in_frame)
     rms = float(np.sqrt((found.fit.errors[0] ** 2).sum(axis=1).mean()))
     return found if rms <= config.align_spread * rounds[-1][1] else None
-
-
-def _ideal(pixels: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels (n, 2) float64 of the camera without distortion."""
-    return camera.directions(pixels)[:, :2].astype(np.float64) * (camera.fx, camera.fy) + (camera.cx, camera.cy)
 
 
 def _best_start(

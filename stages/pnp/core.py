@@ -19,7 +19,7 @@ _LEAST_CONFIDENCE = 0.01
 
 @dataclass(frozen=True)
 class PnpResult:
-    """ok and a reason that is a value of bus.messages.Reason; the rest is None, or nothing, where not ok.
+    """ok and a reason that is a value of bus.messages.Reason; where not ok, there is no pose and no inlier.
 
     inliers: (n,) bool, of the points given.  inliers_in_frame: (m, 2) float32, their pixels as matched, or as found in
     the frame since, and there those of landmarks too.  correspondences: how many points these m were among.
@@ -78,7 +78,7 @@ def solve(
     )
     distance = float(np.median(np.linalg.norm(points[found.index] - camera_centre(pose), axis=1)))
     if not _plausible(covariance, found.pixels, longer_side, distance, config):
-        return _failed("implausible_pose", count)
+        return _failed("implausible_pose", count, found.looked_for)
     inliers, in_frame = np.zeros(count, bool), found.pixels.astype(np.float32)
     inliers[found.index[found.index < count]] = True
     rms = float(np.sqrt((residuals**2).sum(axis=1).mean()))
@@ -94,8 +94,9 @@ def warm_up(config: PnpConfig) -> None:
     solve(pixels, points, camera, config, pictures=Pictures(image, depth, camera, np.eye(4), image))
 
 
-def _failed(reason: str, count: int) -> PnpResult:
-    return PnpResult(False, reason, None, np.zeros(count, bool), np.zeros((0, 2), np.float32), count, None, None)
+def _failed(reason: str, count: int, looked_for: int | None = None) -> PnpResult:
+    none = np.zeros((0, 2), np.float32)
+    return PnpResult(False, reason, None, np.zeros(count, bool), none, looked_for or count, None, None)
 
 
 def _weights(confidence: np.ndarray | None, count: int, config: PnpConfig) -> np.ndarray:

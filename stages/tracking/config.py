@@ -32,7 +32,7 @@ class ScoreConfig:
     """Fewer score 0."""
     good_inliers: int = 40
     good_inlier_ratio: float = 0.55
-    """Of the points lifted, those that were found in the frame where the pose puts them."""
+    """Of the points that were looked for, matched ones and landmarks, those found where the pose puts them."""
     good_residual_px: float = 2.0
     """Median reprojection error of the inliers."""
     good_sigma_deg: float = 1.0

@@ -76,6 +76,24 @@ def test_a_distortion_that_folds_the_image_is_refused() -> None:
         folding.directions(np.array([[320.0, 240.0], [0.0, 0.0]]))
 
 
+def test_pixels_without_an_inverse_are_told_from_those_with_one() -> None:
+    folding = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, (-0.5, 0.0, 0.0, 0.0, 0.0))
+    pixels = np.array([[320.0, 240.0], [0.0, 0.0], [400.0, 300.0]])
+    ideal, usable = folding.without_distortion(pixels)
+    assert usable.tolist() == [True, False, True]
+    plain = folding.undistorted().directions(ideal[usable])
+    np.testing.assert_allclose(plain, folding.directions(pixels[usable]), atol=1e-6)
+
+
+@given(cameras(), st.integers(0, 2**32 - 1))
+def test_without_distortion_undoes_it(camera: Camera, seed: int) -> None:
+    ideal = np.random.default_rng(seed).uniform(-0.2, 0.2, (20, 2))
+    points = np.concatenate([ideal, np.ones((20, 1))], axis=1)
+    found, usable = camera.without_distortion(camera.project(points))
+    assert usable.all()
+    np.testing.assert_allclose(found, camera.undistorted().project(points), atol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("k1", "k2", "radius"), [(-0.5, 0.0, 0.56), (-0.5, 0.0, 0.7), (-0.5, 0.0, 1.5), (1.0, -0.5, 1.67)]
 )

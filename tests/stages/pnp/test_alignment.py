@@ -286,6 +286,23 @@ def test_points_found_where_the_lens_has_no_inverse_leave_the_pose_of_the_matche
     assert np.array_equal(pose_of(looked), pose_of(plain))
 
 
+def test_a_point_that_is_found_or_matched_where_the_lens_has_no_inverse_is_no_inlier(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The others hold the pose."""
+    folding = replace(LENS, distortion=(-1.2, 0.0, 0.0, 0.0, 0.0))
+    inner = np.linalg.norm(in_frame(points) - 129.5, axis=1) < 60
+    pixels, count = in_frame(points[inner], folding), int(inner.sum())
+    pixels[:5] = 5.0
+    placed = Placed(np.arange(count), pixels, np.tile(np.eye(2), (count, 1, 1)), np.ones(count, bool))
+    monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: placed)
+    for given in (None, pictures(view, frame)):
+        result = solve(pixels.astype(np.float32), points[inner], folding, PnpConfig(landmarks=0), pictures=given)
+        assert translation_error(pose_of(result), TRUTH) < 1e-3
+        assert not result.inliers[:5].any()
+        assert result.inliers[5:].all()
+
+
 def test_points_out_of_sight_are_not_looked_for(view: RenderedView, frame: np.ndarray, points: np.ndarray) -> None:
     behind = TRUTH.copy()
     behind[2, 3] = -10.0

@@ -82,7 +82,7 @@ def test_the_kernel_does_what_its_plain_twin_does(seed: int, half: int, steps: i
         if abs(np.linalg.norm(place - starts[i]) - 3) > 0.1:  # on the limit either answer is right
             assert places[i] == pytest.approx(place, abs=0.02)
             assert similarity[i] == pytest.approx(alike, abs=0.01)
-            if alike > 0.2:  # what is left beside a plain place, which has no contrast to be scaled, is told otherwise
+            if alike > 0.2:  # far below what counts as found; a plain place has no contrast that could be scaled
                 assert spread[i] == pytest.approx(doubt, rel=0.1, abs=0.01 * np.trace(doubt) + 1e-6)
 
 

@@ -116,9 +116,15 @@ def test_a_pose_is_none_that_its_inliers_leave_uncertain() -> None:
     assert (refused.ok, refused.reason) == (False, "implausible_pose")
 
 
-@pytest.mark.parametrize("setting", [{"align_half": 0}, {"align_levels": -1}, {"attempts": 0}])
+@pytest.mark.parametrize("setting", [{"align_half": 0}, {"align_levels": -1}, {"landmarks": -1}, {"attempts": 0}])
 def test_settings_that_mean_nothing_are_refused(setting: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=r"pnp: \w+ is -?\d, but must be at least \d"):
+        PnpConfig(**setting)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("setting", [{"min_support": -0.1}, {"sure_landmarks": 30.0}, {"min_landmarks": 1.01}])
+def test_shares_that_are_none_are_refused(setting: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=r"pnp: \w+ is -?[\d.]+, but is a share, from 0 to 1"):
         PnpConfig(**setting)  # type: ignore[arg-type]
 
 

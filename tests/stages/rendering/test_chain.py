@@ -72,6 +72,7 @@ def test_a_perturbed_guess_leads_to_the_pose(make_nodes: Any, image: np.ndarray,
     assert pose.refined  # type: ignore[attr-defined]
     assert pose.loss_after < pose.loss_before  # type: ignore[attr-defined]
     assert pose.inliers <= pose.correspondences  # type: ignore[attr-defined]
+    assert pose.correspondences > said[CORRESPONDENCES].kept.sum()  # type: ignore[attr-defined]
     assert said[CORRESPONDENCES].camera == said[FRAME].camera  # type: ignore[attr-defined]
     assert pose.header.frame_id == 1
 

@@ -17,7 +17,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from scipy.spatial.distance import pdist
 
 from stages.errors import DatasetError
-from stages.geometry import rays
+from stages.geometry import points_at_depth
 from stages.nerf.metadata import TrainingCamera
 from stages.nerf.rendering_api import RayRenderer
 
@@ -72,8 +72,7 @@ def _seen_by(renderer: RayRenderer, view: TrainingCamera) -> np.ndarray:
     camera = camera.scaled(min(1.0, _SIZE / max(camera.width, camera.height)))
     rendered = renderer.render_view(camera, pose)
     y, x = np.nonzero((rendered.opacity > 0.5) & (rendered.depth > 0))
-    origins, directions = rays(camera, pose, np.stack([x, y], axis=1).astype(np.float32))
-    return origins + rendered.depth[y, x, None] * directions
+    return points_at_depth(camera, pose, np.stack([x, y], axis=1), rendered.depth[y, x])
 
 
 def add(cam_from_object: np.ndarray, truth: np.ndarray, surface: Surface) -> float:

@@ -1,6 +1,6 @@
 """Cameras, rigid transforms, pose errors and random poses: what every stage shares."""
 
-from stages.geometry.cameras import Camera, rays
+from stages.geometry.cameras import Camera, points_at_depth, rays
 from stages.geometry.errors import mahalanobis_squared, rotation_error_deg, translation_error, viewing_angles
 from stages.geometry.rigid import (
     adjoint,
@@ -30,6 +30,7 @@ __all__ = [
     "mahalanobis_squared",
     "nearest_rigid",
     "perturb",
+    "points_at_depth",
     "rays",
     "rotation_about",
     "rotation_error_deg",

@@ -150,6 +150,13 @@ def rays(
     return np.repeat(origin[None], len(directions), axis=0), directions
 
 
+def points_at_depth(camera: Camera, cam_from_object: np.ndarray, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """Points (n, 3) float32 in object coordinates that are seen at pixels (n, 2), at depths (n,) along the axis."""
+    origins, directions = rays(camera, cam_from_object, pixels)
+    points: np.ndarray = origins + depths[:, None] * directions
+    return points
+
+
 def _solve_2x2(matrix: np.ndarray, determinant: np.ndarray, right: np.ndarray) -> np.ndarray:
     safe = np.where(np.abs(determinant) > 1e-6, determinant, 1e-6)
     x = (matrix[:, 1, 1] * right[:, 0] - matrix[:, 0, 1] * right[:, 1]) / safe

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry import Camera, rays
+from stages.geometry import Camera, camera_centre, points_at_depth
 from stages.lifting.config import LiftingConfig
 from stages.lifting.memory import ConsistencyMemory, Remember
 from stages.nerf.rendering_api import RayRenderer
@@ -54,14 +54,13 @@ def lift(
     scale = 255.0 if opacity.dtype == np.uint8 else 1.0
     seen = (depths > 0) & (_nearest(opacity, pixels_in_view) >= config.min_opacity * scale)
     depths = np.where(seen, depths, 0).astype(np.float32)
-    origins, directions = rays(camera, cam_from_object, pixels_in_view)
-    points = origins + depths[:, None] * directions
+    points = points_at_depth(camera, cam_from_object, pixels_in_view, depths)
     spread = np.full(len(points), _NEVER, np.float32)
     if seen.any():
-        on_surface = points[seen]
+        on_surface, centre = points[seen], camera_centre(cam_from_object)
 
         def look(index: np.ndarray | slice) -> np.ndarray:
-            return consistency(renderer, on_surface[index], origins[0], rng, config)
+            return consistency(renderer, on_surface[index], centre, rng, config)
 
         spread[seen] = look(slice(None)) if remember is None else remember(pixels_in_view[seen], look)
     unit = 1.0 if config.gamma_unit == "field" else depths / camera.fx

@@ -131,10 +131,11 @@ def train_field(
         replace_metadata(metadata, trained_seconds=time.monotonic() - start, trained_steps=trainer.steps)
     )
     field.occupied = finer(field.occupied, trainer.densities, metadata.space.step)
-    field.save(out)  # what comes after it takes a while
+    # Saved after each step, since what comes next takes a while and may be ended by Ctrl-C.
+    field.save(out)
     images = [over_background(view.image, dataset.background) for view in views]
     field.descriptors = remember(images)
-    field.save(out)  # and so does this
+    field.save(out)
     scores = evaluate(NumbaRenderer(field, training.threads), held_out) if held_out and not interrupted else []
     if scores:
         field.metadata = replace_metadata(field.metadata, psnr_db=float(np.mean(scores)))

@@ -57,7 +57,7 @@ def solve(
     config = config or PnpConfig()
     count, longer_side = len(pixels_in_frame), max(camera.width, camera.height)
     if count < max(config.min_inliers, MIN_POINTS):
-        return _failed("too_few_consistent_points", count)
+        return _failed("too_few_consistent_points", count, count)
     points = points_in_object.astype(np.float64)
     weights = _weights(confidence, count, config)
     if pictures is None or config.align_levels == 0:
@@ -68,7 +68,7 @@ def solve(
         aligner = Aligner(pictures, points, camera, config)
         found = confirmed_pose(pixels_in_frame, points, camera, weights, aligner, config)
     if found is None:
-        return _failed("no_consensus", count)
+        return _failed("no_consensus", count, len(points))
     fit, pose = found.fit, found.fit.cam_from_object
     angles = viewing_angles(points[found.index], pose if seen_from is None else seen_from, pose)
     shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles))
@@ -94,9 +94,9 @@ def warm_up(config: PnpConfig) -> None:
     solve(pixels, points, camera, config, pictures=Pictures(image, depth, camera, np.eye(4), image))
 
 
-def _failed(reason: str, count: int, looked_for: int | None = None) -> PnpResult:
-    none = np.zeros((0, 2), np.float32)
-    return PnpResult(False, reason, None, np.zeros(count, bool), none, looked_for or count, None, None)
+def _failed(reason: str, count: int, looked_for: int) -> PnpResult:
+    nowhere = np.zeros((0, 2), np.float32)
+    return PnpResult(False, reason, None, np.zeros(count, bool), nowhere, looked_for, None, None)
 
 
 def _weights(confidence: np.ndarray | None, count: int, config: PnpConfig) -> np.ndarray:

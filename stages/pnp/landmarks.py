@@ -8,7 +8,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.geometry import rays
+from stages.geometry import points_at_depth
 from stages.pnp.alignment import Pictures
 
 _LEAST_QUALITY = 0.01
@@ -24,9 +24,8 @@ def landmarks(pictures: Pictures, most: int) -> np.ndarray:
     None is taken where the depth steps between neighbours by a tenth or more, as it does where the object ends.
     """
     pixels = _corners(pictures.grey, pictures.depth, most)
-    origins, directions = rays(pictures.camera, pictures.cam_from_object, pixels)
     column, row = pixels.astype(int).T
-    points: np.ndarray = origins + pictures.depth[row, column, None] * directions
+    points = points_at_depth(pictures.camera, pictures.cam_from_object, pixels, pictures.depth[row, column])
     return points.astype(np.float64)
 
 

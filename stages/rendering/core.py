@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry import Camera, rays, viewing_angles
+from stages.geometry import Camera, points_at_depth, viewing_angles
 from stages.nerf.rendering_api import RayRenderer, RenderedView
 from stages.rendering.config import RenderingConfig
 
@@ -92,8 +92,8 @@ def _probes(view: RenderedView) -> np.ndarray:
     surface = np.flatnonzero((view.opacity > 0.5) & (view.depth > 0))
     chosen = surface[np.linspace(0, len(surface) - 1, min(_PROBES, len(surface))).astype(int)]
     y, x = np.divmod(chosen, view.camera.width)
-    origins, directions = rays(view.camera, view.cam_from_object, np.stack([x, y], axis=1))
-    return (origins + view.depth.ravel()[chosen, None] * directions).astype(np.float64)
+    points = points_at_depth(view.camera, view.cam_from_object, np.stack([x, y], axis=1), view.depth[y, x])
+    return points.astype(np.float64)
 
 
 def _difference(cached: _Cached, cam_from_object: np.ndarray) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stages.errors import StageError
-from stages.geometry import Camera, look_at, rays
+from stages.geometry import Camera, exp_se3, look_at, points_at_depth, rays
 from stages.geometry.cameras import distort
 
 # The phone camera of instant-ngp's fox, and one with every coefficient at work.
@@ -83,6 +83,16 @@ def test_pixels_without_an_inverse_are_told_from_those_with_one() -> None:
     assert usable.tolist() == [True, False, True]
     plain = folding.undistorted().directions(ideal[usable])
     np.testing.assert_allclose(plain, folding.directions(pixels[usable]), atol=1e-6)
+
+
+@given(cameras(), st.integers(0, 2**32 - 1))
+def test_points_at_a_depth_are_seen_there_and_at_their_pixels(camera: Camera, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pose, pixels = exp_se3(rng.normal(0, 1, 6)), rng.uniform(0.3, 0.6, (20, 2)) * (camera.width, camera.height)
+    depths = rng.uniform(0.5, 4, 20)
+    in_cam = points_at_depth(camera, pose, pixels, depths) @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(in_cam[:, 2], depths, rtol=1e-4)
+    np.testing.assert_allclose(camera.project(in_cam), pixels, atol=0.02)
 
 
 @given(cameras(), st.integers(0, 2**32 - 1))

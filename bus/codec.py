@@ -13,8 +13,8 @@ import msgpack
 import msgspec
 import numpy as np
 
-from bus.errors import CodecError
-from bus.messages import Header, Message
+from fieldpose.bus.errors import CodecError
+from fieldpose.bus.messages import Header, Message
 
 M = TypeVar("M", bound=Message)
 

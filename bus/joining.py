@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from bus.messages import Header, Message
-from bus.topics import FRAME, JOIN_CAPACITY, Topic
+from fieldpose.bus.messages import Header, Message
+from fieldpose.bus.topics import FRAME, JOIN_CAPACITY, Topic
 
 Key = tuple[int, int, int]
 

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeVar
 
-from bus.protocol import Closer, Closing, Sink, Watcher, key_matches
-from bus.topics import Topic
+from fieldpose.bus.protocol import Closer, Closing, Sink, Watcher, key_matches
+from fieldpose.bus.topics import Topic
 
 T = TypeVar("T")
 

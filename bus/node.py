@@ -15,14 +15,14 @@ from typing import Protocol
 import numpy as np
 import psutil
 
-from bus.errors import CodecError
-from bus.joining import Joined, Joiner, kept
-from bus.logs import Throttle, stage_logger
-from bus.messages import Header, Message, Reason, Stats
-from bus.ports import Inbox, InboxCounts, Outbox, first_header, reply_header
-from bus.protocol import SETTLE_S, Bus
-from bus.signals import Interrupted, StopSignals
-from bus.topics import FRAME, STATS, Address, Topic
+from fieldpose.bus.errors import CodecError
+from fieldpose.bus.joining import Joined, Joiner, kept
+from fieldpose.bus.logs import Throttle, stage_logger
+from fieldpose.bus.messages import Header, Message, Reason, Stats
+from fieldpose.bus.ports import Inbox, InboxCounts, Outbox, first_header, reply_header
+from fieldpose.bus.protocol import SETTLE_S, Bus
+from fieldpose.bus.signals import Interrupted, StopSignals
+from fieldpose.bus.topics import FRAME, STATS, Address, Topic
 
 __all__ = ["EndOfInput", "Handler", "JoinedHandler", "Output", "first_header", "reply_header", "run_node"]
 

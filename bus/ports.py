@@ -12,11 +12,11 @@ from typing import NamedTuple
 
 import msgspec
 
-from bus.codec import decode, encode
-from bus.errors import CodecError
-from bus.messages import Header, Message
-from bus.topics import Address, Topic
-from bus.transport import Bus, Closing
+from fieldpose.bus.codec import decode, encode
+from fieldpose.bus.errors import CodecError
+from fieldpose.bus.messages import Header, Message
+from fieldpose.bus.topics import Address, Topic
+from fieldpose.bus.transport import Bus, Closing
 
 
 def first_header(frame_id: int, capture_ns: int, pass_index: int = 0) -> Header:

@@ -7,8 +7,8 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
-from bus.errors import TransportError
-from bus.topics import Address, Topic
+from fieldpose.bus.errors import TransportError
+from fieldpose.bus.topics import Address, Topic
 
 SETTLE_S = 2.0
 

@@ -8,13 +8,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bus.codec import decode_header
-from bus.errors import CodecError, RecordingError
-from bus.messages import Header, Message
-from bus.node import Output
-from bus.protocol import Bus, Closing, Sink
-from bus.recording import RecordingWriter, partial_path, recover
-from bus.topics import ALL, Address, Topic
+from fieldpose.bus.codec import decode_header
+from fieldpose.bus.errors import CodecError, RecordingError
+from fieldpose.bus.messages import Header, Message
+from fieldpose.bus.node import Output
+from fieldpose.bus.protocol import Bus, Closing, Sink
+from fieldpose.bus.recording import RecordingWriter, partial_path, recover
+from fieldpose.bus.topics import ALL, Address, Topic
 
 __all__ = ["RECORDED", "Recorder", "RecorderHandler", "RecordingWriter", "partial_path", "recover"]
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import msgspec
 from mcap.writer import CompressionType, Writer
 
-from bus.codec import decode, encode
-from bus.errors import CodecError, RecordingError
-from bus.messages import Header, Message
-from bus.ports import Sequences
-from bus.replay import RECORDING_RECORD, SOURCE_RECORD, Attachment, Salvage
-from bus.topics import Topic, topic_of
+from fieldpose.bus.codec import decode, encode
+from fieldpose.bus.errors import CodecError, RecordingError
+from fieldpose.bus.messages import Header, Message
+from fieldpose.bus.ports import Sequences
+from fieldpose.bus.replay import RECORDING_RECORD, SOURCE_RECORD, Attachment, Salvage
+from fieldpose.bus.topics import Topic, topic_of
 
 _CHUNK_BYTES = 2 << 20
 _FLUSH_S = 1.0

@@ -19,12 +19,12 @@ from mcap.reader import SeekingReader
 from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import MCAP0_MAGIC
 
-from bus.codec import decode
-from bus.errors import CodecError, RecordingError
-from bus.messages import Message
-from bus.ports import Outbox
-from bus.protocol import Bus
-from bus.topics import Address, Topic, topic_of
+from fieldpose.bus.codec import decode
+from fieldpose.bus.errors import CodecError, RecordingError
+from fieldpose.bus.messages import Message
+from fieldpose.bus.ports import Outbox
+from fieldpose.bus.protocol import Bus
+from fieldpose.bus.topics import Address, Topic, topic_of
 
 SOURCE_RECORD = "fieldpose.source"
 RECORDING_RECORD = "fieldpose.recording"

@@ -6,8 +6,8 @@ import re
 from dataclasses import dataclass
 from typing import Literal
 
-from bus import messages
-from bus.errors import TransportError
+from fieldpose.bus import messages
+from fieldpose.bus.errors import TransportError
 
 _PART_OF_KEY = r"[A-Za-z0-9_.\-]+"
 _PART = re.compile(_PART_OF_KEY + r"|\*")

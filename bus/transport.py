@@ -14,12 +14,12 @@ from typing import Any
 
 import zenoh
 
-from bus.errors import TransportError
-from bus.memory import MemoryBus
-from bus.presence import Presence
-from bus.protocol import Bus, Closer, Closing, Sink, Watcher, wait_for
-from bus.signals import StopSignals
-from bus.topics import Topic
+from fieldpose.bus.errors import TransportError
+from fieldpose.bus.memory import MemoryBus
+from fieldpose.bus.presence import Presence
+from fieldpose.bus.protocol import Bus, Closer, Closing, Sink, Watcher, wait_for
+from fieldpose.bus.signals import StopSignals
+from fieldpose.bus.topics import Topic
 
 __all__ = [
     "LOCAL_HUB", "Bus", "Closing", "MemoryBus", "Sink", "Watcher", "ZenohBus", "log_to_stderr", "serve_hub",

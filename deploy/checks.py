@@ -17,9 +17,9 @@ from typing import Literal
 
 import psutil
 
-from bus.errors import FieldposeError
-from deploy.endpoints import free_port
-from stages.errors import StageError
+from fieldpose.bus.errors import FieldposeError
+from fieldpose.deploy.processes.endpoints import free_port
+from fieldpose.stages.errors import StageError
 
 _PACKAGES = ("torch", "kornia", "numba", "numpy", "opencv-python-headless", "eclipse-zenoh", "mcap", "supervisor")
 _SHARED_MEMORY = Path("/dev/shm")
@@ -90,7 +90,7 @@ def bus() -> Iterator[Finding]:
 
 def weights() -> Iterator[Finding]:
     """Whether each matcher can be had, and how long it takes to load."""
-    from stages.matching.core import MATCHERS, MatchingConfig, build_matcher
+    from fieldpose.stages.matching.core import MATCHERS, MatchingConfig, build_matcher
 
     default = MatchingConfig().matcher
     for name in MATCHERS:
@@ -107,7 +107,7 @@ def kernels() -> Iterator[Finding]:
     """Whether the field's kernels are compiled already."""
     from numba import config
 
-    import stages.nerf.kernels  # noqa: F401 (says where the cache is)
+    import fieldpose.stages.nerf.kernels  # noqa: F401 (says where the cache is)
 
     folder = Path(config.CACHE_DIR)
     compiled = len(list(folder.rglob("*.nbi")))
@@ -118,7 +118,7 @@ def kernels() -> Iterator[Finding]:
 
 def demo_scene() -> Iterator[Finding]:
     """Whether the embedded scene is there."""
-    from deploy.scene import demo_file
+    from fieldpose.deploy.scene import demo_file
 
     for name in ("field.safetensors", "sequence.mcap"):
         try:
@@ -129,7 +129,7 @@ def demo_scene() -> Iterator[Finding]:
 
 def field(path: Path) -> Iterator[Finding]:
     """Whether a field can be loaded."""
-    from stages.nerf.field import load_field
+    from fieldpose.stages.nerf.field import load_field
 
     try:
         found = load_field(path)
@@ -140,7 +140,7 @@ def field(path: Path) -> Iterator[Finding]:
     quality = "not measured" if about.psnr_db is None else f"{about.psnr_db:.1f} dB"
     yield Finding("field", "ok", f"{path}: {about.dataset_kind}, {len(about.cameras)} training views, {quality}")
     if about.accuracy is not None:
-        from deploy.accuracy import in_words
+        from fieldpose.deploy.evaluation.accuracy import in_words
 
         yield Finding("field", "ok", in_words(about.accuracy))
     if found.descriptors is None:
@@ -150,7 +150,7 @@ def field(path: Path) -> Iterator[Finding]:
 
 def dataset(path: Path) -> Iterator[Finding]:
     """Whether a dataset can be read, every image of it."""
-    from stages.nerf.datasets import load_dataset
+    from fieldpose.stages.nerf.datasets import load_dataset
 
     try:
         found = load_dataset(path, "all")
@@ -167,8 +167,8 @@ def dataset(path: Path) -> Iterator[Finding]:
 
 
 def _round_trips_ms() -> list[float]:
-    from bus.topics import VIEW
-    from bus.transport import ZenohBus, serve_hub
+    from fieldpose.bus.topics import VIEW
+    from fieldpose.bus.transport import ZenohBus, serve_hub
 
     hub, stop = f"tcp/127.0.0.1:{free_port()}", threading.Event()
     serving = threading.Thread(target=serve_hub, args=(hub, None, stop), daemon=True)

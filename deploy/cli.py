@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from deploy.errors import UsageError
+from fieldpose.deploy.errors import UsageError
 
 COMMANDS = {
     "demo": "the embedded scene through the whole pipeline",
@@ -65,7 +65,7 @@ def _dispatch(arguments: list[str]) -> int:
     name, *rest = arguments
     if name not in COMMANDS:
         raise UsageError(f"no command {name!r}; expected one of {', '.join(COMMANDS)}")
-    module = importlib.import_module(f"deploy.commands.{name}")
+    module = importlib.import_module(f"fieldpose.deploy.commands.{name}")
     return int(parse(module.Options, name, rest).run())
 
 
@@ -97,7 +97,7 @@ def _defaults(options: type[Any], arguments: list[str]) -> Any:
         return None
     import tyro
 
-    from deploy.settings import read_settings
+    from fieldpose.deploy.settings import read_settings
 
     required = [name for name, field in names.items() if _is_required(field)]
     return options(**dict.fromkeys(required, tyro.MISSING), settings=read_settings(Path(given)))
@@ -130,8 +130,8 @@ def _one_line(framed: str) -> str:
 
 
 def _is_for_the_user(error: Exception) -> bool:
-    from bus.errors import FieldposeError
-    from stages.errors import StageError
+    from fieldpose.bus.errors import FieldposeError
+    from fieldpose.stages.errors import StageError
 
     return isinstance(error, FieldposeError | StageError)
 

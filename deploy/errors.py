@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bus.errors import FieldposeError
+from fieldpose.bus.errors import FieldposeError
 
 
 class UsageError(FieldposeError):

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from bus.logs import stage_logger
-from deploy.settings import Settings
-from stages.errors import WeightsError
-from stages.geometry import Camera
-from stages.matching.core import PairMatcher
-from stages.rendering.core import view_camera
-from stages.retrieval.core import Describe, Retriever, describer
-from stages.tracking.views import TrainingViews
+from fieldpose.bus.logs import stage_logger
+from fieldpose.deploy.settings import Settings
+from fieldpose.stages.errors import WeightsError
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.matching.core import PairMatcher
+from fieldpose.stages.rendering.core import view_camera
+from fieldpose.stages.retrieval.core import Describe, Retriever, describer
+from fieldpose.stages.tracking.views import TrainingViews
 
 
 class Lookalikes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bus.errors import FieldposeError
+from fieldpose.bus.errors import FieldposeError
 
 _FOLDER = Path(__file__).resolve().parent.parent / "recordings" / "demo"
 
@@ -14,6 +14,6 @@ def demo_file(name: str) -> Path:
     path = _FOLDER / name
     if not path.is_file():
         raise FieldposeError(
-            f"{path}: no such file; the demo scene is part of the repository: clone it, and `make install` there"
+            f"{path}: no such file; the demo scene is missing from this installation: install fieldpose again"
         )
     return path

@@ -16,16 +16,16 @@ from typing import Any, TypeVar, get_type_hints
 
 import msgspec
 
-from bus.topics import Address
-from stages.camera.config import CameraConfig
-from stages.errors import ConfigError
-from stages.lifting.config import LiftingConfig
-from stages.matching.core import MatchingConfig
-from stages.pnp.config import PnpConfig
-from stages.refinement.config import RefinementConfig
-from stages.rendering.config import RenderingConfig
-from stages.retrieval.config import RetrievalConfig
-from stages.tracking.config import TrackingConfig
+from fieldpose.bus.topics import Address
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.errors import ConfigError
+from fieldpose.stages.lifting.config import LiftingConfig
+from fieldpose.stages.matching.core import MatchingConfig
+from fieldpose.stages.pnp.config import PnpConfig
+from fieldpose.stages.refinement.config import RefinementConfig
+from fieldpose.stages.rendering.config import RenderingConfig
+from fieldpose.stages.retrieval.config import RetrievalConfig
+from fieldpose.stages.tracking.config import TrackingConfig
 
 T = TypeVar("T")
 

@@ -7,8 +7,8 @@ from dataclasses import asdict, fields
 import cv2
 import numpy as np
 
-from bus.messages import CameraModel, Frame, Header
-from stages.geometry import Camera
+from fieldpose.bus.messages import CameraModel, Frame, Header
+from fieldpose.stages.geometry import Camera
 
 NO_CAMERA = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0)
 """Stands for the camera in the messages of failures, where none is known."""

@@ -11,12 +11,11 @@ from typing import Annotated, Any
 import tyro
 from rich.table import Table
 
-from deploy.output import check_writable, progress_console, result_console, write_json
-from deploy.repository import ROOT, benchmark
-from deploy.scene import demo_file
-from stages.nerf.config import FieldConfig
+from fieldpose.deploy.reporting.output import check_writable, progress_console, result_console, write_json
+from fieldpose.deploy.scene import demo_file
+from fieldpose.stages.nerf.config import FieldConfig
 
-_DATA = ROOT.parent / "shared" / "data"
+_DATA = Path("..") / "shared" / "data"
 _SIZES = {"lego": 400, "demo": 400, "fern": 504, "fox": 480}
 
 
@@ -47,7 +46,8 @@ class Render:
     def run(self) -> int:
         """Measure, print, plot."""
         check_writable(self.json)
-        render = benchmark("render")
+        from fieldpose.deploy.benchmarks import render
+
         dataset = self.dataset or _first_dataset()
         with progress_console().status("training the field") as status:
             path = render.field_of(self.field, dataset, 400, self.minutes, self.out)
@@ -83,7 +83,8 @@ class Train:
     def run(self) -> int:
         """Measure, print, plot."""
         check_writable(self.json)
-        train = benchmark("train")
+        from fieldpose.deploy.benchmarks import train
+
         datasets = [(path, _SIZES.get(path.resolve().name, 400)) for path in self.datasets or _all_datasets()]
         with progress_console().status("bench train") as status:
             report = _into(status.update, "bench train")

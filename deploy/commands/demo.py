@@ -12,13 +12,13 @@ from typing import Annotated
 import tyro
 from rich.progress import Progress
 
-from deploy.commands.run import INTERRUPTED, give_out
-from deploy.output import check_writable, progress_console, write_bytes, write_json
-from deploy.pipeline import Plan, run_pipeline
-from deploy.report import live_line
-from deploy.results import RunResult
-from deploy.scene import demo_file
-from deploy.settings import Settings, for_video
+from fieldpose.deploy.commands.run import INTERRUPTED, give_out
+from fieldpose.deploy.processes.pipeline import Plan, run_pipeline
+from fieldpose.deploy.reporting.output import check_writable, progress_console, write_bytes, write_json
+from fieldpose.deploy.reporting.report import live_line
+from fieldpose.deploy.reporting.results import RunResult
+from fieldpose.deploy.scene import demo_file
+from fieldpose.deploy.settings import Settings, for_video
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,9 @@ class Options:
         return 0
 
     def _show(self, outcome: RunResult, field: Path, recording: Path) -> None:
-        from deploy.overlay import encoded
-        from deploy.showing import pictures, write_video
-        from stages.nerf.loading import load_renderer
+        from fieldpose.deploy.reporting.overlay import encoded
+        from fieldpose.deploy.reporting.showing import pictures, write_video
+        from fieldpose.stages.nerf.loading import load_renderer
 
         renderer = load_renderer(field, threads=0)
         with _bar("rendering the video") as report:

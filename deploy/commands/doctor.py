@@ -9,9 +9,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from deploy import checks
-from deploy.checks import Check, Finding
-from deploy.output import progress_console, result_console, write_json
+from fieldpose.deploy import checks
+from fieldpose.deploy.checks import Check, Finding
+from fieldpose.deploy.reporting.output import progress_console, result_console, write_json
 
 _COLOURS = {"ok": "green", "note": "cyan", "warning": "yellow", "failed": "red"}
 

@@ -11,11 +11,11 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from deploy.errors import UsageError
-from deploy.output import check_writable, write_bytes, write_json
-from deploy.settings import Settings
-from stages.geometry import Camera
-from stages.nerf.metadata import FieldMetadata
+from fieldpose.deploy.errors import UsageError
+from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
+from fieldpose.deploy.settings import Settings
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.nerf.metadata import FieldMetadata
 
 _ASPECT_TOLERANCE = 0.01
 
@@ -54,11 +54,11 @@ class Options:
 
     def run(self) -> int:
         """Estimate, print the pose."""
-        from deploy.single import PoseFinder
-        from stages.nerf.field import load_field
-        from stages.nerf.loading import make_renderer
-        from stages.tracking.guesses import start_pose
-        from stages.tracking.views import training_views
+        from fieldpose.deploy.local import PoseFinder
+        from fieldpose.stages.nerf.field import load_field
+        from fieldpose.stages.nerf.loading import make_renderer
+        from fieldpose.stages.tracking.guesses import start_pose
+        from fieldpose.stages.tracking.views import training_views
 
         check_writable(self.json, self.overlay)
         field = load_field(self.field)
@@ -86,7 +86,7 @@ class Options:
         quality = f"{found.inliers} of {found.correspondences} points agree, {found.residual_px:.2f} px"
         print(f"{quality}, {found.passes} passes, {seconds:.2f} s{', refined' if found.refined else ''}")
         if self.overlay is not None:
-            from deploy.overlay import encoded, overlaid
+            from fieldpose.deploy.reporting.overlay import encoded, overlaid
 
             picture = overlaid(image, renderer.render_view(camera.undistorted(), found.cam_from_object))
             write_bytes(self.overlay, encoded(picture, self.overlay))
@@ -94,8 +94,8 @@ class Options:
 
     def _image(self, metadata: FieldMetadata) -> tuple[np.ndarray, Camera]:
         """The pixels (h, w, 3) uint8 and the camera. Raises DatasetError and SourceError."""
-        from stages.camera.calibration import calibrate
-        from stages.nerf.datasets.images import load_pixels, over_background, probe
+        from fieldpose.stages.camera.calibration import calibrate
+        from fieldpose.stages.nerf.datasets.images import load_pixels, over_background, probe
 
         header = probe(self.image)
         width, height = header.width, header.height

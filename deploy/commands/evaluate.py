@@ -13,18 +13,18 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from deploy.errors import UsageError
-from deploy.output import check_writable, result_console, write_json
-from deploy.settings import Settings
+from fieldpose.deploy.errors import UsageError
+from fieldpose.deploy.reporting.output import check_writable, result_console, write_json
+from fieldpose.deploy.settings import Settings
 
 if TYPE_CHECKING:
-    from deploy.evaluation.occlusion import DrawThing
-    from deploy.evaluation.pairs import Protocol
-    from deploy.evaluation.scores import Answer
-    from deploy.evaluation.surface import Surface
-    from stages.nerf.datasets import Dataset
-    from stages.nerf.field import Field
-    from stages.nerf.rendering_api import RayRenderer
+    from fieldpose.deploy.evaluation.occlusion import DrawThing
+    from fieldpose.deploy.evaluation.pairs import Protocol
+    from fieldpose.deploy.evaluation.scores import Answer
+    from fieldpose.deploy.evaluation.surface import Surface
+    from fieldpose.stages.nerf.datasets import Dataset
+    from fieldpose.stages.nerf.field import Field
+    from fieldpose.stages.nerf.rendering_api import RayRenderer
 
 _WRITTEN_EVERY_S = 60.0
 
@@ -87,12 +87,12 @@ class Options:
 
     def run(self) -> int:
         """Evaluate, print the table."""
-        from deploy.evaluation import pairs
-        from deploy.evaluation.running import Examination, shown
-        from stages.nerf.datasets import load_dataset
-        from stages.nerf.field import load_field
-        from stages.nerf.loading import make_renderer, warm_up
-        from stages.tracking.views import training_views
+        from fieldpose.deploy.evaluation import pairs
+        from fieldpose.deploy.evaluation.running import Examination, shown
+        from fieldpose.stages.nerf.datasets import load_dataset
+        from fieldpose.stages.nerf.field import load_field
+        from fieldpose.stages.nerf.loading import make_renderer, warm_up
+        from fieldpose.stages.tracking.views import training_views
 
         check_writable(self.json, self.plot)
         self._check()
@@ -145,7 +145,7 @@ class Options:
 
     def _methods(self, recalls: bool) -> Sequence[str]:
         """Their names. `recalls`: whether the field remembers how its training views look."""
-        from deploy.evaluation.methods import DEFAULT, METHODS
+        from fieldpose.deploy.evaluation.methods import DEFAULT, METHODS
 
         possible = tuple(name for name, method in METHODS.items() if recalls or not method.recalls)
         if "all" in self.method:
@@ -158,7 +158,7 @@ class Options:
         return tuple(dict.fromkeys(self.method)) or DEFAULT
 
     def _protocol(self, surface: Surface | None) -> Protocol:
-        from deploy.evaluation.pairs import PROTOCOLS
+        from fieldpose.deploy.evaluation.pairs import PROTOCOLS
 
         protocol = PROTOCOLS[self.protocol]
         shift = protocol.max_translation if self.shift is None else self.shift
@@ -173,7 +173,7 @@ class Options:
 
     def _surface(self, field: Field, renderer: RayRenderer) -> Surface | None:
         """The object's surface; None for a scene without bounds."""
-        from deploy.evaluation.surface import read_surface, surface_of
+        from fieldpose.deploy.evaluation.surface import read_surface, surface_of
 
         if self.surface is not None:
             return read_surface(self.surface)
@@ -183,15 +183,15 @@ class Options:
 
     def _thing(self, protocol: Protocol) -> DrawThing | None:
         """What is pasted over the images."""
-        from deploy.evaluation.occlusion import objects_of, painted
-        from stages.nerf.datasets import load_dataset
+        from fieldpose.deploy.evaluation.occlusion import objects_of, painted
+        from fieldpose.stages.nerf.datasets import load_dataset
 
         if not protocol.occluded:
             return None
         return painted if self.occluders is None else objects_of(load_dataset(self.occluders, "test", self.size))
 
     def _draw(self, answers: Mapping[str, Sequence[Answer]], surface: Surface | None) -> None:
-        from deploy.evaluation.plots import plot_reach, plot_success
+        from fieldpose.deploy.evaluation.plots import plot_reach, plot_success
 
         if self.plot is None:
             return
@@ -210,8 +210,8 @@ def _warn_of_training_images(field: Field, dataset: Dataset) -> None:
 
 
 def _scores(answers: Mapping[str, Sequence[Answer]], surface: Surface | None) -> dict[str, Any]:
-    from deploy.evaluation.methods import METHODS
-    from deploy.evaluation.scores import difference, score, share_of_solvable
+    from fieldpose.deploy.evaluation.methods import METHODS
+    from fieldpose.deploy.evaluation.scores import difference, score, share_of_solvable
 
     answers = {name: given for name, given in answers.items() if given}
     first, *others = answers

@@ -11,9 +11,9 @@ from pathlib import Path
 import tyro
 from rich.table import Table
 
-from bus.replay import RECORDING_RECORD, RecordingInfo, info
-from deploy.output import result_console, write_json
-from deploy.provenance import RUN_RECORD
+from fieldpose.bus.replay import RECORDING_RECORD, RecordingInfo, info
+from fieldpose.deploy.reporting.output import result_console, write_json
+from fieldpose.deploy.reporting.provenance import RUN_RECORD
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ from typing import Annotated
 
 import tyro
 
-from bus.recorder import Recorder
-from bus.signals import StopSignals
-from bus.topics import Address
-from bus.transport import LOCAL_HUB, ZenohBus
-from deploy.endpoints import peer_address
-from deploy.output import check_writable, progress_console
+from fieldpose.bus.recorder import Recorder
+from fieldpose.bus.signals import StopSignals
+from fieldpose.bus.topics import Address
+from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
+from fieldpose.deploy.processes.endpoints import peer_address
+from fieldpose.deploy.reporting.output import check_writable, progress_console
 
 _HUB_S = 5.0
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from bus.errors import RecordingError
-from bus.recording import partial_path, recover
+from fieldpose.bus.errors import RecordingError
+from fieldpose.bus.recording import partial_path, recover
 
 
 @dataclass(frozen=True)

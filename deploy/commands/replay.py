@@ -11,18 +11,18 @@ from typing import Any, cast
 import numpy as np
 import tyro
 
-from bus.messages import State
-from bus.replay import RecordingInfo, info, read_recording
-from bus.topics import STATE
-from deploy.commands.run import INTERRUPTED
-from deploy.output import check_writable, result_console, write_json
-from deploy.pipeline import Plan, run_pipeline
-from deploy.provenance import recorded_field, recorded_settings
-from deploy.report import live_line, print_summary
-from deploy.results import FrameResult, spread, summarise
-from deploy.settings import Settings, changed, read_file
-from stages.camera.config import Pace
-from stages.geometry import rotation_error_deg, translation_error
+from fieldpose.bus.messages import State
+from fieldpose.bus.replay import RecordingInfo, info, read_recording
+from fieldpose.bus.topics import STATE
+from fieldpose.deploy.commands.run import INTERRUPTED
+from fieldpose.deploy.processes.pipeline import Plan, run_pipeline
+from fieldpose.deploy.reporting.output import check_writable, result_console, write_json
+from fieldpose.deploy.reporting.provenance import recorded_field, recorded_settings
+from fieldpose.deploy.reporting.report import live_line, print_summary
+from fieldpose.deploy.reporting.results import FrameResult, spread, summarise
+from fieldpose.deploy.settings import Settings, changed, read_file
+from fieldpose.stages.camera.config import Pace
+from fieldpose.stages.geometry import rotation_error_deg, translation_error
 
 
 @dataclass(frozen=True)

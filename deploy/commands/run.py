@@ -9,15 +9,15 @@ from typing import Annotated, Literal, TypeVar
 
 import tyro
 
-from deploy.errors import UsageError
-from deploy.output import check_writable, write_bytes, write_json
-from deploy.pipeline import Plan, run_pipeline
-from deploy.report import live_line, print_summary
-from deploy.results import RunResult, summarise, to_csv
-from deploy.settings import Settings, for_video
-from stages.camera.config import Pace
-from stages.camera.sources import is_video
-from stages.nerf.field import load_field
+from fieldpose.deploy.errors import UsageError
+from fieldpose.deploy.processes.pipeline import Plan, run_pipeline
+from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
+from fieldpose.deploy.reporting.report import live_line, print_summary
+from fieldpose.deploy.reporting.results import RunResult, summarise, to_csv
+from fieldpose.deploy.settings import Settings, for_video
+from fieldpose.stages.camera.config import Pace
+from fieldpose.stages.camera.sources import is_video
+from fieldpose.stages.nerf.field import load_field
 
 INTERRUPTED = 130
 

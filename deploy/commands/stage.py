@@ -12,13 +12,13 @@ from typing import Annotated, Literal
 
 import tyro
 
-from bus.node import Handler, run_node
-from bus.transport import LOCAL_HUB, ZenohBus, log_to_stderr, serve_hub, wait_for
-from deploy.endpoints import peer_address
-from deploy.lifeline import die_with_parent
-from deploy.processes import CAMERA, TABLE, Launch, ProcessSpec, thread_environment, threads_of
-from deploy.settings import Settings
-from deploy.warmup import compile_kernels
+from fieldpose.bus.node import Handler, run_node
+from fieldpose.bus.transport import LOCAL_HUB, ZenohBus, log_to_stderr, serve_hub, wait_for
+from fieldpose.deploy.graph import CAMERA, TABLE, Launch, ProcessSpec, thread_environment, threads_of
+from fieldpose.deploy.processes.endpoints import peer_address
+from fieldpose.deploy.processes.lifeline import die_with_parent
+from fieldpose.deploy.processes.warmup import compile_kernels
+from fieldpose.deploy.settings import Settings
 
 _START_S = 300.0
 """Others may be compiling their kernels."""

@@ -15,16 +15,16 @@ import numpy as np
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from deploy.output import check_writable, progress_console, write_json
-from deploy.settings import Settings
-from stages.errors import WeightsError
-from stages.matching.core import MatchingConfig
-from stages.nerf.config import FieldConfig, TrainingConfig
+from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
+from fieldpose.deploy.settings import Settings
+from fieldpose.stages.errors import WeightsError
+from fieldpose.stages.matching.core import MatchingConfig
+from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 
 if TYPE_CHECKING:
-    from stages.nerf.field import Field
-    from stages.nerf.from_dataset import TrainedField, TrainingReport
-    from stages.nerf.metadata import PoseAccuracy
+    from fieldpose.stages.nerf.field import Field
+    from fieldpose.stages.nerf.from_dataset import TrainedField, TrainingReport
+    from fieldpose.stages.nerf.metadata import PoseAccuracy
 
 _LINE_EVERY_S = 30.0
 
@@ -63,8 +63,8 @@ class Options:
 
     def run(self) -> int:
         """Train, say how good the field is."""
-        from deploy.accuracy import in_words
-        from stages.nerf.from_dataset import train_field
+        from fieldpose.deploy.evaluation.accuracy import in_words
+        from fieldpose.stages.nerf.from_dataset import train_field
 
         check_writable(self.out, self.json)
         training = self.training if self.minutes is None else replace(self.training, minutes=self.minutes)
@@ -87,8 +87,8 @@ class Options:
     def _remember(self, images: Iterable[np.ndarray]) -> np.ndarray | None:
         """What the field remembers of its training views; None, said on stderr, where the weights are missing."""
         # Torch takes 300 MB, of which the training has no need.
-        from stages.nerf.field import DESCRIBED_SIZE
-        from stages.retrieval.core import describer, remembered
+        from fieldpose.stages.nerf.field import DESCRIBED_SIZE
+        from fieldpose.stages.retrieval.core import describer, remembered
 
         try:
             describe = describer(self.matching, DESCRIBED_SIZE)
@@ -99,9 +99,9 @@ class Options:
 
     def _examine(self, field: Field, images: Sequence[np.ndarray]) -> PoseAccuracy | None:
         """How well its own training images are found in it; None, said on stderr, where the weights are missing."""
-        from deploy.accuracy import pose_accuracy
-        from stages.nerf.loading import make_renderer
-        from stages.tracking.views import training_views
+        from fieldpose.deploy.evaluation.accuracy import pose_accuracy
+        from fieldpose.stages.nerf.loading import make_renderer
+        from fieldpose.stages.tracking.views import training_views
 
         renderer = make_renderer(field, self.training.threads)
         try:

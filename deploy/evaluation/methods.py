@@ -8,13 +8,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from bus.messages import Reason
-from deploy.repository import benchmark
-from deploy.settings import Settings
-from deploy.single import PoseFinder, PoseFound
-from stages.geometry import Camera
-from stages.nerf.rendering_api import RayRenderer
-from stages.tracking.views import TrainingViews
+from fieldpose.bus.messages import Reason
+from fieldpose.deploy.evaluation.baselines import BASELINES
+from fieldpose.deploy.local import PoseFinder, PoseFound
+from fieldpose.deploy.settings import Settings
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.nerf.rendering_api import RayRenderer
+from fieldpose.stages.tracking.views import TrainingViews
 
 
 class Finder(Protocol):
@@ -56,7 +56,7 @@ class _FromLookalike:
 
 
 class _Baseline:
-    """A published method of tests/benchmark/baselines; it always believes its answer."""
+    """A published method of deploy/evaluation/baselines; it always believes its answer."""
 
     def __init__(self, method: Any) -> None:
         self._method = method
@@ -87,7 +87,7 @@ def _retrieved(change: Callable[[Settings], Settings]) -> Method:
 
 def _published(name: str, *, slow: bool = True, scale_known: bool = True, **config: Any) -> Method:
     def make(renderer: RayRenderer, settings: Settings, views: TrainingViews) -> Finder:
-        return _Baseline(benchmark("baselines").BASELINES[name](renderer, settings, **config))
+        return _Baseline(BASELINES[name](renderer, settings, **config))
 
     return Method(make, slow, scale_known)
 
@@ -137,7 +137,7 @@ pixels around the keypoints or, -anywhere, of the whole image, -adam, by the pap
 -refined: a single pass, without the guess, from the training view most like the image, all of which are rendered
 beforehand; passes: up to tracking.passes of them, from other guesses where the first leads nowhere; full: those and
 refinement. essential: rotations from matches alone; inerf, -2048: with so many rays a step; pi-nerf, -camera: turned
-about the camera and drawn less widely, closer to its publication; these five are in tests/benchmark/baselines."""
+about the camera and drawn less widely, closer to its publication; these five are in deploy/evaluation/baselines."""
 
 _PREPARED_MB = 4096.0
 DEFAULT = ("one-step", "one-step-unmined", "passes", "full")

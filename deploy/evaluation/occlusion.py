@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from stages.errors import DatasetError
-from stages.nerf.datasets import Dataset
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.nerf.datasets import Dataset
 
 DrawThing = Callable[[np.random.Generator], np.ndarray]
 """Gives something to paste, (h, w, 4) uint8 RGBA."""

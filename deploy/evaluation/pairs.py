@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from stages.geometry import camera_centre, perturb, rotation_error_deg, translation_error
+from fieldpose.stages.geometry import camera_centre, perturb, rotation_error_deg, translation_error
 
 TurnAbout = Literal["origin", "camera"]
 

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.stats import chi2
 
-from deploy.evaluation.scores import DIMENSIONS, Answer, curve, tells_translations
+from fieldpose.deploy.evaluation.scores import DIMENSIONS, Answer, curve, tells_translations
 
 Answers = Mapping[str, Sequence[Answer]]
 

@@ -10,16 +10,16 @@ from itertools import groupby, product
 import numpy as np
 from rich.progress import track
 
-from deploy.evaluation.methods import METHODS, Finder
-from deploy.evaluation.occlusion import DrawThing, occluded
-from deploy.evaluation.pairs import Pair
-from deploy.evaluation.scores import Answer
-from deploy.output import progress_console
-from deploy.settings import Settings
-from stages.geometry import Camera
-from stages.nerf.datasets import Dataset
-from stages.nerf.rendering_api import RayRenderer
-from stages.tracking.views import TrainingViews
+from fieldpose.deploy.evaluation.methods import METHODS, Finder
+from fieldpose.deploy.evaluation.occlusion import DrawThing, occluded
+from fieldpose.deploy.evaluation.pairs import Pair
+from fieldpose.deploy.evaluation.scores import Answer
+from fieldpose.deploy.reporting.output import progress_console
+from fieldpose.deploy.settings import Settings
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.nerf.datasets import Dataset
+from fieldpose.stages.nerf.rendering_api import RayRenderer
+from fieldpose.stages.tracking.views import TrainingViews
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from deploy.evaluation.pairs import Pair
-from deploy.evaluation.surface import SHARE, Surface, add, add_s, area_under_curve
-from deploy.results import CLOSE, CLOSE_DEG
-from stages.geometry import mahalanobis_squared, rotation_error_deg, translation_error
+from fieldpose.deploy.evaluation.pairs import Pair
+from fieldpose.deploy.evaluation.surface import SHARE, Surface, add, add_s, area_under_curve
+from fieldpose.deploy.reporting.results import CLOSE, CLOSE_DEG
+from fieldpose.stages.geometry import mahalanobis_squared, rotation_error_deg, translation_error
 
 CAP_DEG, CAP = 4 * CLOSE_DEG, 4 * CLOSE
 """Where errors are capped for comparisons, in degrees and in units of the field: four times the limits."""

@@ -16,10 +16,10 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 from scipy.spatial.distance import pdist
 
-from stages.errors import DatasetError
-from stages.geometry import points_at_depth
-from stages.nerf.metadata import TrainingCamera
-from stages.nerf.rendering_api import RayRenderer
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.geometry import points_at_depth
+from fieldpose.stages.nerf.metadata import TrainingCamera
+from fieldpose.stages.nerf.rendering_api import RayRenderer
 
 SHARE = 0.1
 """Of the diameter: the usual limit of a right pose, and the end of the curve."""

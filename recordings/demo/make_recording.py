@@ -18,9 +18,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from bus.messages import CameraModel, Frame, Header, Truth
-from bus.recorder import RecordingWriter
-from bus.topics import FRAME, TRUTH, Address
+from fieldpose.bus.messages import CameraModel, Frame, Header, Truth
+from fieldpose.bus.recorder import RecordingWriter
+from fieldpose.bus.topics import FRAME, TRUTH, Address
 
 SOURCE = "camera"
 STARTED_NS = 1_750_000_000_000_000_000

@@ -11,10 +11,10 @@ import msgspec
 import numpy as np
 from PIL import Image
 
-from bus.messages import CameraModel
-from stages.camera.config import CameraConfig
-from stages.errors import SourceError, StageError
-from stages.geometry import Camera
+from fieldpose.bus.messages import CameraModel
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.errors import SourceError, StageError
+from fieldpose.stages.geometry import Camera
 
 _EXIF_IFD = 0x8769
 _FOCAL_LENGTH_35MM = 0xA405

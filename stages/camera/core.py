@@ -8,9 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from stages.camera.config import CameraConfig, Pace
-from stages.errors import ConfigError
-from stages.geometry import Camera
+from fieldpose.stages.camera.config import CameraConfig, Pace
+from fieldpose.stages.errors import ConfigError
+from fieldpose.stages.geometry import Camera
 
 _BURST = 8
 _DEFAULT_RATE_HZ = 30.0

@@ -5,12 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Iterator
 
-from bus.logs import stage_logger
-from bus.messages import Message
-from bus.node import EndOfInput, Output
-from bus.topics import FRAME, POSE, STATE, TRUTH, Topic
-from stages.camera.config import CameraConfig
-from stages.camera.sender import Sender
+from fieldpose.bus.logs import stage_logger
+from fieldpose.bus.messages import Message
+from fieldpose.bus.node import EndOfInput, Output
+from fieldpose.bus.topics import FRAME, POSE, STATE, TRUTH, Topic
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.sender import Sender
 
 
 class CameraNode:

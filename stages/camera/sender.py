@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from bus.messages import Message, State
-from bus.node import Output
-from stages.camera.config import CameraConfig
-from stages.camera.core import Feed
-from stages.camera.progress import Progress
-from stages.camera.sources import open_source
-from stages.camera.wire import messages_of
-from stages.errors import SourceError, StageError
+from fieldpose.bus.messages import Message, State
+from fieldpose.bus.node import Output
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.core import Feed
+from fieldpose.stages.camera.progress import Progress
+from fieldpose.stages.camera.sources import open_source
+from fieldpose.stages.camera.wire import messages_of
+from fieldpose.stages.errors import SourceError, StageError
 
 
 class Sender:

@@ -7,10 +7,10 @@ from dataclasses import asdict
 
 import numpy as np
 
-from bus.messages import CameraModel, Frame, Truth
-from bus.node import Output, first_header
-from bus.topics import FRAME, TRUTH
-from stages.camera.core import CapturedFrame
+from fieldpose.bus.messages import CameraModel, Frame, Truth
+from fieldpose.bus.node import Output, first_header
+from fieldpose.bus.topics import FRAME, TRUTH
+from fieldpose.stages.camera.core import CapturedFrame
 
 
 def messages_of(frame: CapturedFrame, capture_ns: int) -> Iterator[Output]:

@@ -1,8 +1,8 @@
 """Cameras, rigid transforms, pose errors and random poses: what every stage shares."""
 
-from stages.geometry.cameras import Camera, points_at_depth, rays
-from stages.geometry.errors import mahalanobis_squared, rotation_error_deg, translation_error, viewing_angles
-from stages.geometry.rigid import (
+from fieldpose.stages.geometry.cameras import Camera, points_at_depth, rays
+from fieldpose.stages.geometry.errors import mahalanobis_squared, rotation_error_deg, translation_error, viewing_angles
+from fieldpose.stages.geometry.rigid import (
     adjoint,
     camera_centre,
     exp_se3,
@@ -14,8 +14,8 @@ from stages.geometry.rigid import (
     nearest_rigid,
     rotation_about,
 )
-from stages.geometry.sampling import perturb
-from stages.geometry.uncertainty import twist_covariance
+from fieldpose.stages.geometry.sampling import perturb
+from fieldpose.stages.geometry.uncertainty import twist_covariance
 
 __all__ = [
     "Camera",

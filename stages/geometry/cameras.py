@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stages.errors import StageError
+from fieldpose.stages.errors import StageError
 
 _UNDISTORTED = (0.0, 0.0, 0.0, 0.0, 0.0)
 _NEWTON_STEPS = 25

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stages.geometry.rigid import camera_centre, inverse, log_se3
+from fieldpose.stages.geometry.rigid import camera_centre, inverse, log_se3
 
 
 def rotation_error_deg(cam_from_object_a: np.ndarray, cam_from_object_b: np.ndarray) -> float:

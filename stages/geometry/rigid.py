@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from stages.errors import StageError
+from fieldpose.stages.errors import StageError
 
 _SMALL_ANGLE = 1e-4
 

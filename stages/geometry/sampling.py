@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stages.geometry.rigid import from_rotation, inverse, rotation_about
+from fieldpose.stages.geometry.rigid import from_rotation, inverse, rotation_about
 
 
 def perturb(

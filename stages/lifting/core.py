@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry import Camera, camera_centre, points_at_depth
-from stages.lifting.config import LiftingConfig
-from stages.lifting.memory import ConsistencyMemory, Remember
-from stages.nerf.rendering_api import RayRenderer
+from fieldpose.stages.geometry import Camera, camera_centre, points_at_depth
+from fieldpose.stages.lifting.config import LiftingConfig
+from fieldpose.stages.lifting.memory import ConsistencyMemory, Remember
+from fieldpose.stages.nerf.rendering_api import RayRenderer
 
 __all__ = ["ConsistencyMemory", "Lifted", "LiftingConfig", "consistency", "depth_at", "lift"]
 

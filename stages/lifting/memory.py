@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from stages.last_used import LastUsed
+from fieldpose.stages.last_used import LastUsed
 
 _VIEWS = 128
 

@@ -8,13 +8,13 @@ from typing import cast
 
 import numpy as np
 
-from bus.messages import Correspondences, Guess, Header, Matches, Message, Reason, View
-from bus.node import JoinedHandler, Output, reply_header
-from bus.topics import CORRESPONDENCES, GUESS, MATCHES, VIEW, Topic
-from stages.lifting.config import LiftingConfig
-from stages.lifting.core import ConsistencyMemory, lift
-from stages.nerf.loading import load_renderer, warm_up
-from stages.wire import NO_CAMERA, camera_of, frame_rng
+from fieldpose.bus.messages import Correspondences, Guess, Header, Matches, Message, Reason, View
+from fieldpose.bus.node import JoinedHandler, Output, reply_header
+from fieldpose.bus.topics import CORRESPONDENCES, GUESS, MATCHES, VIEW, Topic
+from fieldpose.stages.lifting.config import LiftingConfig
+from fieldpose.stages.lifting.core import ConsistencyMemory, lift
+from fieldpose.stages.nerf.loading import load_renderer, warm_up
+from fieldpose.stages.wire import NO_CAMERA, camera_of, frame_rng
 
 
 class LiftingNode(JoinedHandler):

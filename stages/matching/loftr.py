@@ -16,8 +16,8 @@ from kornia.core.download import hf_url
 from kornia.feature import LoFTR
 from kornia.feature.loftr.loftr import default_cfg
 
-from stages.matching.core import Features, MatchedPixels, MatchingConfig
-from stages.matching.weights import WeightsFile, find_weights, load_network
+from fieldpose.stages.matching.core import Features, MatchedPixels, MatchingConfig
+from fieldpose.stages.matching.weights import WeightsFile, find_weights, load_network
 
 WEIGHTS = WeightsFile("loftr_outdoor.ckpt", None, "", (hf_url("loftr", "loftr_outdoor.ckpt"),))
 _PIXEL_CENTRE = 0.5

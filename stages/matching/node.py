@@ -7,11 +7,11 @@ from typing import cast
 
 import numpy as np
 
-from bus.messages import Frame, Header, Matches, Message, Reason, View
-from bus.node import JoinedHandler, Output, reply_header
-from bus.topics import FRAME, MATCHES, VIEW, Topic
-from stages.matching.core import MatchingConfig, PairMatcher, build_matcher
-from stages.wire import frame_image
+from fieldpose.bus.messages import Frame, Header, Matches, Message, Reason, View
+from fieldpose.bus.node import JoinedHandler, Output, reply_header
+from fieldpose.bus.topics import FRAME, MATCHES, VIEW, Topic
+from fieldpose.stages.matching.core import MatchingConfig, PairMatcher, build_matcher
+from fieldpose.stages.wire import frame_image
 
 
 class MatchingNode(JoinedHandler):

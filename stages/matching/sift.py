@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import torch
 
-from stages.matching.core import Features, MatchedPixels, MatchingConfig
-from stages.matching.xfeat import mutual_nearest
+from fieldpose.stages.matching.core import Features, MatchedPixels, MatchingConfig
+from fieldpose.stages.matching.xfeat import mutual_nearest
 
 _MAX_RATIO = 0.85
 _CONTRAST = 0.02

@@ -17,8 +17,8 @@ from kornia.feature import XFeatModel
 from torch.nn import functional
 from torch.nn.utils import fuse_conv_bn_eval
 
-from stages.matching.core import Features, MatchedPixels, MatchingConfig
-from stages.matching.weights import WeightsFile, find_weights, load_network
+from fieldpose.stages.matching.core import Features, MatchedPixels, MatchingConfig
+from fieldpose.stages.matching.weights import WeightsFile, find_weights, load_network
 
 WEIGHTS = WeightsFile(
     "xfeat.pt",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from stages.errors import ConfigError
+from fieldpose.stages.errors import ConfigError
 
 Backend = Literal["numba", "torch", "cuda"]
 """Compiled kernels on the CPU; torch on the CPU (slow, plain); torch on a CUDA device."""

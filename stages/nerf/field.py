@@ -11,12 +11,12 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from stages.errors import FieldFileError
-from stages.nerf.config import FieldConfig
-from stages.nerf.kernels.space import BLOCK
-from stages.nerf.kernels.types import SH_SIZE, Domain, Net
-from stages.nerf.metadata import FORMAT_VERSION, FieldMetadata, Space
-from stages.nerf.occupancy import pack
+from fieldpose.stages.errors import FieldFileError
+from fieldpose.stages.nerf.config import FieldConfig
+from fieldpose.stages.nerf.kernels.space import BLOCK
+from fieldpose.stages.nerf.kernels.types import SH_SIZE, Domain, Net
+from fieldpose.stages.nerf.metadata import FORMAT_VERSION, FieldMetadata, Space
+from fieldpose.stages.nerf.occupancy import pack
 
 DESCRIPTOR_SIZE = 64
 DESCRIBED_SIZE = 400

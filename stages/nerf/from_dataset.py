@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from stages.nerf.config import FieldConfig, TrainingConfig
-from stages.nerf.datasets import Dataset, load_dataset
-from stages.nerf.datasets.images import over_background
-from stages.nerf.field import Field
-from stages.nerf.metadata import FieldMetadata, PoseAccuracy, Space, TrainingCamera
-from stages.nerf.occupancy import finer
-from stages.nerf.raybank import View
-from stages.nerf.renderer import NumbaRenderer
-from stages.nerf.training import Learner, Progress, Trainer, evaluate
+from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
+from fieldpose.stages.nerf.datasets import Dataset, load_dataset
+from fieldpose.stages.nerf.datasets.images import over_background
+from fieldpose.stages.nerf.field import Field
+from fieldpose.stages.nerf.metadata import FieldMetadata, PoseAccuracy, Space, TrainingCamera
+from fieldpose.stages.nerf.occupancy import finer
+from fieldpose.stages.nerf.raybank import View
+from fieldpose.stages.nerf.renderer import NumbaRenderer
+from fieldpose.stages.nerf.training import Learner, Progress, Trainer, evaluate
 
 if TYPE_CHECKING:
-    from stages.nerf.datasets.assemble import Holdout
+    from fieldpose.stages.nerf.datasets.assemble import Holdout
 
 BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), None: (0.5, 0.5, 0.5)}
 BOUNDED_STEP, CONTRACTED_STEP = 2 / 384, 1 / 128
@@ -149,8 +149,8 @@ def make_learner(views: list[View], space: Space, config: FieldConfig, training:
     """Compiled kernels, or torch on the CPU or on CUDA. Raises ConfigError where there is no CUDA device."""
     if training.backend == "numba":
         return Trainer(views, space, config, training)
-    from stages.nerf.torch_renderer import torch_device
-    from stages.nerf.torch_training import TorchTrainer
+    from fieldpose.stages.nerf.torch_renderer import torch_device
+    from fieldpose.stages.nerf.torch_training import TorchTrainer
 
     return TorchTrainer(views, space, config, training, torch_device(training.backend))
 

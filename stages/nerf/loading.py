@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.geometry import Camera
-from stages.nerf.config import Backend
-from stages.nerf.field import Field, load_field
-from stages.nerf.renderer import NumbaRenderer
-from stages.nerf.rendering_api import RayRenderer
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.nerf.config import Backend
+from fieldpose.stages.nerf.field import Field, load_field
+from fieldpose.stages.nerf.renderer import NumbaRenderer
+from fieldpose.stages.nerf.rendering_api import RayRenderer
 
 
 def load_renderer(path: str | Path, threads: int = 1, backend: Backend = "numba") -> RayRenderer:
@@ -23,7 +23,7 @@ def make_renderer(field: Field, threads: int = 1, backend: Backend = "numba") ->
     if backend == "numba":
         return NumbaRenderer(field, threads)
     # Torch takes 200 MB and seconds to import; a process that only renders on the CPU does without.
-    from stages.nerf.torch_renderer import TorchRenderer, torch_device
+    from fieldpose.stages.nerf.torch_renderer import TorchRenderer, torch_device
 
     return TorchRenderer(field, torch_device(backend))
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from stages.geometry import Camera
-from stages.nerf.config import FieldConfig
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.nerf.config import FieldConfig
 
 FORMAT_VERSION = 1
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.nerf.metadata import Space
+from fieldpose.stages.nerf.metadata import Space
 
 
 def normalised(

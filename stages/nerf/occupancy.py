@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 from scipy.ndimage import distance_transform_cdt
 
-from stages.geometry.cameras import Camera
-from stages.nerf.kernels.density import raise_to
-from stages.nerf.kernels.space import BLOCK
-from stages.nerf.metadata import Space
+from fieldpose.stages.geometry.cameras import Camera
+from fieldpose.stages.nerf.kernels.density import raise_to
+from fieldpose.stages.nerf.kernels.space import BLOCK
+from fieldpose.stages.nerf.metadata import Space
 
 
 def pack(occupied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -7,11 +7,11 @@ from functools import partial
 
 import numpy as np
 
-from stages.nerf.field import LEARNT
-from stages.nerf.kernels.adam import adam_step
-from stages.nerf.kernels.train import Gradients
-from stages.nerf.kernels.types import Net
-from stages.nerf.workers import Scratch, Workers
+from fieldpose.stages.nerf.field import LEARNT
+from fieldpose.stages.nerf.kernels.adam import adam_step
+from fieldpose.stages.nerf.kernels.train import Gradients
+from fieldpose.stages.nerf.kernels.types import Net
+from fieldpose.stages.nerf.workers import Scratch, Workers
 
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-15
 """Instant-NGP's settings."""

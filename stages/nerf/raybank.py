@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry.cameras import Camera
-from stages.nerf.metadata import Space
+from fieldpose.stages.geometry.cameras import Camera
+from fieldpose.stages.nerf.metadata import Space
 
 
 @dataclass(frozen=True)

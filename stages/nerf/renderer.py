@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.geometry import Camera, camera_centre
-from stages.nerf.field import Field
-from stages.nerf.kernels.jacobian import render_jacobian
-from stages.nerf.kernels.render import render, render_tiles
-from stages.nerf.kernels.sight import block_centres, block_radius, tile_limits
-from stages.nerf.kernels.types import Net
-from stages.nerf.kernels.vectors import WIDTH, reads_half_floats
-from stages.nerf.metadata import FieldMetadata
-from stages.nerf.normalise import by_object_rays, normalised
-from stages.nerf.rendering_api import RenderedRays, RenderedView
-from stages.nerf.tiles import TILE, view_tiles
-from stages.nerf.workers import Workers
+from fieldpose.stages.geometry import Camera, camera_centre
+from fieldpose.stages.nerf.field import Field
+from fieldpose.stages.nerf.kernels.jacobian import render_jacobian
+from fieldpose.stages.nerf.kernels.render import render, render_tiles
+from fieldpose.stages.nerf.kernels.sight import block_centres, block_radius, tile_limits
+from fieldpose.stages.nerf.kernels.types import Net
+from fieldpose.stages.nerf.kernels.vectors import WIDTH, reads_half_floats
+from fieldpose.stages.nerf.metadata import FieldMetadata
+from fieldpose.stages.nerf.normalise import by_object_rays, normalised
+from fieldpose.stages.nerf.rendering_api import RenderedRays, RenderedView
+from fieldpose.stages.nerf.tiles import TILE, view_tiles
+from fieldpose.stages.nerf.workers import Workers
 
 PACKET = TILE * TILE
 PER_RAY = 4

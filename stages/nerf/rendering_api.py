@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from stages.geometry.cameras import Camera
+from fieldpose.stages.geometry.cameras import Camera
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from stages.geometry import Camera
-from stages.nerf.kernels.types import Tiles
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.nerf.kernels.types import Tiles
 
 TILE = 8
 """Pixels along a tile's side."""

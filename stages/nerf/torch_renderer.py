@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from stages.errors import ConfigError
-from stages.geometry import Camera, rays
-from stages.nerf.config import Backend
-from stages.nerf.field import Field
-from stages.nerf.normalise import by_object_rays, normalised
-from stages.nerf.rendering_api import RenderedRays, RenderedView
-from stages.nerf.twin import TwinField, TwinRays, twin_of
+from fieldpose.stages.errors import ConfigError
+from fieldpose.stages.geometry import Camera, rays
+from fieldpose.stages.nerf.config import Backend
+from fieldpose.stages.nerf.field import Field
+from fieldpose.stages.nerf.normalise import by_object_rays, normalised
+from fieldpose.stages.nerf.rendering_api import RenderedRays, RenderedView
+from fieldpose.stages.nerf.twin import TwinField, TwinRays, twin_of
 
 CHUNK = 4096
 

@@ -6,14 +6,14 @@ import numpy as np
 import torch
 from torch.nn.functional import huber_loss
 
-from stages.nerf.config import FieldConfig, TrainingConfig
-from stages.nerf.field import new_net
-from stages.nerf.kernels.types import Net
-from stages.nerf.metadata import Space
-from stages.nerf.optimiser import BETA1, BETA2, EPSILON
-from stages.nerf.raybank import Batch, View
-from stages.nerf.training import Learner
-from stages.nerf.twin import TwinField, distortion_loss
+from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
+from fieldpose.stages.nerf.field import new_net
+from fieldpose.stages.nerf.kernels.types import Net
+from fieldpose.stages.nerf.metadata import Space
+from fieldpose.stages.nerf.optimiser import BETA1, BETA2, EPSILON
+from fieldpose.stages.nerf.raybank import Batch, View
+from fieldpose.stages.nerf.training import Learner
+from fieldpose.stages.nerf.twin import TwinField, distortion_loss
 
 DENSITY_CHUNK = 1 << 18
 

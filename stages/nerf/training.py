@@ -10,20 +10,20 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from stages.geometry import camera_centre
-from stages.geometry.cameras import rays
-from stages.nerf.config import FieldConfig, TrainingConfig
-from stages.nerf.datasets.bounds import nearest_point_to_axes
-from stages.nerf.field import Field, domain_of, new_net
-from stages.nerf.kernels.density import densities
-from stages.nerf.kernels.train import train
-from stages.nerf.kernels.types import Net
-from stages.nerf.metadata import FieldMetadata, Space
-from stages.nerf.occupancy import OccupancyEstimate, near_cameras, seen_by_cameras
-from stages.nerf.optimiser import Optimiser
-from stages.nerf.raybank import Batch, RayBank, View
-from stages.nerf.renderer import NumbaRenderer
-from stages.nerf.workers import Workers
+from fieldpose.stages.geometry import camera_centre
+from fieldpose.stages.geometry.cameras import rays
+from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
+from fieldpose.stages.nerf.datasets.bounds import nearest_point_to_axes
+from fieldpose.stages.nerf.field import Field, domain_of, new_net
+from fieldpose.stages.nerf.kernels.density import densities
+from fieldpose.stages.nerf.kernels.train import train
+from fieldpose.stages.nerf.kernels.types import Net
+from fieldpose.stages.nerf.metadata import FieldMetadata, Space
+from fieldpose.stages.nerf.occupancy import OccupancyEstimate, near_cameras, seen_by_cameras
+from fieldpose.stages.nerf.optimiser import Optimiser
+from fieldpose.stages.nerf.raybank import Batch, RayBank, View
+from fieldpose.stages.nerf.renderer import NumbaRenderer
+from fieldpose.stages.nerf.workers import Workers
 
 PACKET, PACKET_ROWS = 128, 768
 ROWS = 16384

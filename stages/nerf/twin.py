@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from stages.nerf.field import LEARNT, Field
-from stages.nerf.kernels.packet import MAX_EXPONENT
-from stages.nerf.kernels.types import Net
-from stages.nerf.metadata import Space
+from fieldpose.stages.nerf.field import LEARNT, Field
+from fieldpose.stages.nerf.kernels.packet import MAX_EXPONENT
+from fieldpose.stages.nerf.kernels.types import Net
+from fieldpose.stages.nerf.metadata import Space
 
 PRIME_Y, PRIME_Z = 2654435761, 805459861
 

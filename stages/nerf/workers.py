@@ -12,10 +12,10 @@ from threading import Lock
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from stages.nerf.config import FieldConfig
-from stages.nerf.kernels.encoding import LANES
-from stages.nerf.kernels.types import SH_SIZE, Rays, Samples
-from stages.nerf.kernels.vectors import BLOCK
+from fieldpose.stages.nerf.config import FieldConfig
+from fieldpose.stages.nerf.kernels.encoding import LANES
+from fieldpose.stages.nerf.kernels.types import SH_SIZE, Rays, Samples
+from fieldpose.stages.nerf.kernels.vectors import BLOCK
 
 
 def new_samples(config: FieldConfig, rows: int, backward: bool) -> Samples:

@@ -15,11 +15,11 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from stages.geometry import Camera, inverse
-from stages.pnp.config import PnpConfig
-from stages.pnp.least_squares import intrinsics_of
-from stages.pnp.patches import find_patches
-from stages.pnp.warps import warp_patches
+from fieldpose.stages.geometry import Camera, inverse
+from fieldpose.stages.pnp.config import PnpConfig
+from fieldpose.stages.pnp.least_squares import intrinsics_of
+from fieldpose.stages.pnp.patches import find_patches
+from fieldpose.stages.pnp.warps import warp_patches
 
 _PER_LEVEL_OF_GREY = np.float32(1 / 255)
 _LOOSER = 1.4

@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import poselib
 
-from stages.geometry import Camera, is_rigid
-from stages.pnp.alignment import Aligner
-from stages.pnp.config import PnpConfig
-from stages.pnp.least_squares import CONVERGED, PoseFit, alike_in_all_directions, distances_px, fit_pose
+from fieldpose.stages.geometry import Camera, is_rigid
+from fieldpose.stages.pnp.alignment import Aligner
+from fieldpose.stages.pnp.config import PnpConfig
+from fieldpose.stages.pnp.least_squares import CONVERGED, PoseFit, alike_in_all_directions, distances_px, fit_pose
 
 MIN_POINTS = 4
 _ROUNDS = 3

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry import Camera, camera_centre, twist_covariance, viewing_angles
-from stages.pnp.alignment import Aligner, Pictures
-from stages.pnp.config import PnpConfig
-from stages.pnp.consensus import MIN_POINTS, agreed_pose, confirmed_pose
-from stages.pnp.landmarks import landmarks
+from fieldpose.stages.geometry import Camera, camera_centre, twist_covariance, viewing_angles
+from fieldpose.stages.pnp.alignment import Aligner, Pictures
+from fieldpose.stages.pnp.config import PnpConfig
+from fieldpose.stages.pnp.consensus import MIN_POINTS, agreed_pose, confirmed_pose
+from fieldpose.stages.pnp.landmarks import landmarks
 
 __all__ = ["Pictures", "PnpConfig", "PnpResult", "solve", "warm_up"]
 

@@ -8,8 +8,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stages.geometry import points_at_depth
-from stages.pnp.alignment import Pictures
+from fieldpose.stages.geometry import points_at_depth
+from fieldpose.stages.pnp.alignment import Pictures
 
 _LEAST_QUALITY = 0.01
 _APART_PX = 4

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
-from stages.geometry import Camera
+from fieldpose.stages.geometry import Camera
 
 _MAX_STEPS = 20
 CONVERGED = 1e-5

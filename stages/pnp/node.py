@@ -7,12 +7,12 @@ from typing import cast
 
 import numpy as np
 
-from bus.messages import Correspondences, Estimate, Frame, Header, Message, Reason, View
-from bus.node import JoinedHandler, Output, reply_header
-from bus.topics import CORRESPONDENCES, ESTIMATE, FRAME, VIEW, Topic
-from stages.pnp.config import PnpConfig
-from stages.pnp.core import Pictures, solve, warm_up
-from stages.wire import NO_CAMERA, camera_of, frame_image
+from fieldpose.bus.messages import Correspondences, Estimate, Frame, Header, Message, Reason, View
+from fieldpose.bus.node import JoinedHandler, Output, reply_header
+from fieldpose.bus.topics import CORRESPONDENCES, ESTIMATE, FRAME, VIEW, Topic
+from fieldpose.stages.pnp.config import PnpConfig
+from fieldpose.stages.pnp.core import Pictures, solve, warm_up
+from fieldpose.stages.wire import NO_CAMERA, camera_of, frame_image
 
 
 class PnpNode(JoinedHandler):

@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numba import njit
 
-from stages.fastmath import FASTMATH
+from fieldpose.stages.fastmath import FASTMATH
 
 _LEAST_CONTRAST = np.float32(1e-3)
 _LEAST_TEXTURE = 1e-5

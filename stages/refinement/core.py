@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from stages.geometry import Camera
-from stages.nerf.rendering_api import RayRenderer
-from stages.refinement.config import RefinementConfig
-from stages.refinement.optimisers import adam, levenberg_marquardt
-from stages.refinement.photometric import Photometric, keypoint_region
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.nerf.rendering_api import RayRenderer
+from fieldpose.stages.refinement.config import RefinementConfig
+from fieldpose.stages.refinement.optimisers import adam, levenberg_marquardt
+from fieldpose.stages.refinement.photometric import Photometric, keypoint_region
 
 __all__ = ["RefinementConfig", "RefinementResult", "refine"]
 

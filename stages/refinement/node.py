@@ -8,12 +8,12 @@ from typing import cast
 
 import numpy as np
 
-from bus.messages import Estimate, Frame, Header, Message, Pose, Reason
-from bus.node import JoinedHandler, Output, reply_header
-from bus.topics import ESTIMATE, FRAME, POSE, Topic
-from stages.nerf.loading import load_renderer, warm_up
-from stages.refinement.core import RefinementConfig, RefinementResult, refine
-from stages.wire import camera_of, frame_image, frame_rng
+from fieldpose.bus.messages import Estimate, Frame, Header, Message, Pose, Reason
+from fieldpose.bus.node import JoinedHandler, Output, reply_header
+from fieldpose.bus.topics import ESTIMATE, FRAME, POSE, Topic
+from fieldpose.stages.nerf.loading import load_renderer, warm_up
+from fieldpose.stages.refinement.core import RefinementConfig, RefinementResult, refine
+from fieldpose.stages.wire import camera_of, frame_image, frame_rng
 
 
 class RefinementNode(JoinedHandler):

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.geometry import exp_se3
-from stages.refinement.config import RefinementConfig
-from stages.refinement.photometric import Photometric, PixelSample
+from fieldpose.stages.geometry import exp_se3
+from fieldpose.stages.refinement.config import RefinementConfig
+from fieldpose.stages.refinement.photometric import Photometric, PixelSample
 
 _DAMPING, _LESS, _MORE, _MOST = 1e-3, 0.3, 10.0, 1e4
 _LITTLE_GAIN = 1e-4

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from stages.geometry import Camera, twist_covariance
-from stages.nerf.rendering_api import RayRenderer, RenderedRays
-from stages.refinement.config import RefinementConfig
+from fieldpose.stages.geometry import Camera, twist_covariance
+from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedRays
+from fieldpose.stages.refinement.config import RefinementConfig
 
 _SCHARR_SUM = 32
 _SHARPNESS = 8

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry import Camera, points_at_depth, viewing_angles
-from stages.nerf.rendering_api import RayRenderer, RenderedView
-from stages.rendering.config import RenderingConfig
+from fieldpose.stages.geometry import Camera, points_at_depth, viewing_angles
+from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedView
+from fieldpose.stages.rendering.config import RenderingConfig
 
 __all__ = ["RenderingConfig", "SourcedView", "ViewSource", "view_camera"]
 

@@ -9,13 +9,13 @@ from typing import cast
 
 import numpy as np
 
-from bus.messages import Guess, GuessReason, Header, Message, Reason, View
-from bus.node import JoinedHandler, Output, reply_header
-from bus.topics import GUESS, VIEW, Topic
-from stages.nerf.loading import load_renderer, warm_up
-from stages.rendering.config import RenderingConfig
-from stages.rendering.core import ViewSource
-from stages.wire import NO_CAMERA, camera_model, camera_of
+from fieldpose.bus.messages import Guess, GuessReason, Header, Message, Reason, View
+from fieldpose.bus.node import JoinedHandler, Output, reply_header
+from fieldpose.bus.topics import GUESS, VIEW, Topic
+from fieldpose.stages.nerf.loading import load_renderer, warm_up
+from fieldpose.stages.rendering.config import RenderingConfig
+from fieldpose.stages.rendering.core import ViewSource
+from fieldpose.stages.wire import NO_CAMERA, camera_model, camera_of
 
 
 class RenderingNode(JoinedHandler):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from stages.errors import ConfigError
+from fieldpose.stages.errors import ConfigError
 
 _MOST = 256
 """Candidates that fit into a message."""

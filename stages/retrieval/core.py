@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.matching.core import MatchingConfig, shrink
-from stages.nerf.field import DESCRIPTOR_SIZE
-from stages.retrieval.config import RetrievalConfig
+from fieldpose.stages.matching.core import MatchingConfig, shrink
+from fieldpose.stages.nerf.field import DESCRIPTOR_SIZE
+from fieldpose.stages.retrieval.config import RetrievalConfig
 
 __all__ = ["Describe", "Ranking", "RetrievalConfig", "Retriever", "describer", "remembered"]
 
@@ -70,7 +70,7 @@ class Retriever:
 
 def describer(matching: MatchingConfig, longer_side: int, keypoints: int = _REMEMBERED) -> Describe:
     """Describes images, no larger than `longer_side`, by XFeat, whatever the matcher is. Raises WeightsError."""
-    from stages.matching.xfeat import XFeatExtractor
+    from fieldpose.stages.matching.xfeat import XFeatExtractor
 
     weights = matching.weights if matching.matcher.startswith("xfeat") else None
     extractor = XFeatExtractor(

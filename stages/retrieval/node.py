@@ -9,17 +9,17 @@ from typing import cast
 
 import numpy as np
 
-from bus.logs import stage_logger
-from bus.messages import Frame, Guess, GuessReason, Header, Message, Reason, Retrieved
-from bus.node import JoinedHandler, Output, reply_header
-from bus.topics import FRAME, GUESS, RETRIEVED, Topic
-from stages.errors import WeightsError
-from stages.matching.core import MatchingConfig
-from stages.nerf.field import load_field
-from stages.retrieval.config import RetrievalConfig
-from stages.retrieval.core import Retriever, describer
-from stages.tracking.views import training_views
-from stages.wire import frame_image
+from fieldpose.bus.logs import stage_logger
+from fieldpose.bus.messages import Frame, Guess, GuessReason, Header, Message, Reason, Retrieved
+from fieldpose.bus.node import JoinedHandler, Output, reply_header
+from fieldpose.bus.topics import FRAME, GUESS, RETRIEVED, Topic
+from fieldpose.stages.errors import WeightsError
+from fieldpose.stages.matching.core import MatchingConfig
+from fieldpose.stages.nerf.field import load_field
+from fieldpose.stages.retrieval.config import RetrievalConfig
+from fieldpose.stages.retrieval.core import Retriever, describer
+from fieldpose.stages.tracking.views import training_views
+from fieldpose.stages.wire import frame_image
 
 _ANSWERED = 64
 

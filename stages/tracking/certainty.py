@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.tracking.distance import Limit
+from fieldpose.stages.tracking.distance import Limit
 
 _ELSEWHERE_DEG, _ELSEWHERE = 10.0, 0.2
 """So far from where its view was, in degrees or x scale, a pose errs as on any scene."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Literal
 
-from stages.errors import ConfigError
+from fieldpose.stages.errors import ConfigError
 
 
 @dataclass(frozen=True)

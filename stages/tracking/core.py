@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.tracking.config import TrackingConfig
-from stages.tracking.motion import NS_PER_MS
-from stages.tracking.policy import Attempt, Belief, FrameInfo, Policy, PoseGuess, PoseResult
+from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.motion import NS_PER_MS
+from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, Policy, PoseGuess, PoseResult
 
 _LATENCY_SMOOTHING = 0.2
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry import rotation_error_deg, translation_error
+from fieldpose.stages.geometry import rotation_error_deg, translation_error
 
 
 @dataclass(frozen=True)

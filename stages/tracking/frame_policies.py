@@ -8,15 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bus.messages import GuessReason, TrackingState
-from stages.geometry import perturb
-from stages.tracking.certainty import Certainty
-from stages.tracking.config import TrackingConfig
-from stages.tracking.distance import Limit
-from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
-from stages.tracking.retrieved import Poses
-from stages.tracking.scoring import believed, score
-from stages.tracking.views import TrainingViews, nearest_first
+from fieldpose.bus.messages import GuessReason, TrackingState
+from fieldpose.stages.geometry import perturb
+from fieldpose.stages.tracking.certainty import Certainty
+from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.distance import Limit
+from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
+from fieldpose.stages.tracking.retrieved import Poses
+from fieldpose.stages.tracking.scoring import believed, score
+from fieldpose.stages.tracking.views import TrainingViews, nearest_first
 
 _TRUTHS_KEPT = 256
 

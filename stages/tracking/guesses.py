@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from stages.errors import ConfigError
-from stages.geometry import is_rigid, nearest_rigid
-from stages.tracking.config import TrackingConfig
-from stages.tracking.frame_policies import Disturbance, EachFramePolicy, PerturbedTruthPolicy
-from stages.tracking.policy import Policy
-from stages.tracking.retrieved import RetrievedPoses
-from stages.tracking.track_policy import TrackPolicy
-from stages.tracking.views import TrainingViews
+from fieldpose.stages.errors import ConfigError
+from fieldpose.stages.geometry import is_rigid, nearest_rigid
+from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.frame_policies import Disturbance, EachFramePolicy, PerturbedTruthPolicy
+from fieldpose.stages.tracking.policy import Policy
+from fieldpose.stages.tracking.retrieved import RetrievedPoses
+from fieldpose.stages.tracking.track_policy import TrackPolicy
+from fieldpose.stages.tracking.views import TrainingViews
 
 _PERTURB = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)deg,(\d+(?:\.\d+)?)")
 _RIGID_TOLERANCE = 1e-3

@@ -6,8 +6,8 @@ import bisect
 
 import numpy as np
 
-from stages.geometry import exp_se3, inverse, log_se3
-from stages.tracking.config import MotionConfig
+from fieldpose.stages.geometry import exp_se3, inverse, log_se3
+from fieldpose.stages.tracking.config import MotionConfig
 
 NS_PER_MS = 1e6
 _REMEMBERED = 16

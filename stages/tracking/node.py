@@ -8,17 +8,17 @@ from pathlib import Path
 
 import numpy as np
 
-from bus.messages import Frame, Message, Pose, Retrieved, Truth
-from bus.node import Output
-from bus.ports import Sequences
-from bus.topics import FRAME, GUESS, POSE, RETRIEVED, STATE, TRUTH, Topic
-from stages.nerf.field import load_field
-from stages.tracking import core
-from stages.tracking.config import TrackingConfig
-from stages.tracking.guesses import make_policy, needs_truth
-from stages.tracking.retrieved import RetrievedPoses
-from stages.tracking.views import training_views
-from stages.tracking.wire import copied, frame_info, outputs_of, pose_result
+from fieldpose.bus.messages import Frame, Message, Pose, Retrieved, Truth
+from fieldpose.bus.node import Output
+from fieldpose.bus.ports import Sequences
+from fieldpose.bus.topics import FRAME, GUESS, POSE, RETRIEVED, STATE, TRUTH, Topic
+from fieldpose.stages.nerf.field import load_field
+from fieldpose.stages.tracking import core
+from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.guesses import make_policy, needs_truth
+from fieldpose.stages.tracking.retrieved import RetrievedPoses
+from fieldpose.stages.tracking.views import training_views
+from fieldpose.stages.tracking.wire import copied, frame_info, outputs_of, pose_result
 
 
 class TrackingNode:

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from bus.messages import GuessReason, TrackingState
+from fieldpose.bus.messages import GuessReason, TrackingState
 
 
 @dataclass(frozen=True)

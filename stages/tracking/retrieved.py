@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from stages.tracking.policy import FrameInfo
+from fieldpose.stages.tracking.policy import FrameInfo
 
 _KEPT = 64
 

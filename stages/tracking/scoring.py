@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stages.tracking.config import ScoreConfig, TrackingConfig
-from stages.tracking.distance import Limit
-from stages.tracking.policy import PoseResult
+from fieldpose.stages.tracking.config import ScoreConfig, TrackingConfig
+from fieldpose.stages.tracking.distance import Limit
+from fieldpose.stages.tracking.policy import PoseResult
 
 
 def score(result: PoseResult, config: ScoreConfig, scale: float = 1.0) -> float:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from bus.messages import GuessReason, TrackingState
-from stages.tracking.certainty import Certainty
-from stages.tracking.config import TrackingConfig
-from stages.tracking.distance import Limit
-from stages.tracking.motion import NS_PER_MS, MotionModel
-from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
-from stages.tracking.retrieved import RetrievedPoses
-from stages.tracking.scoring import score
-from stages.tracking.trust import Trust
-from stages.tracking.views import Keyframes, Relocaliser, TrainingViews
+from fieldpose.bus.messages import GuessReason, TrackingState
+from fieldpose.stages.tracking.certainty import Certainty
+from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.distance import Limit
+from fieldpose.stages.tracking.motion import NS_PER_MS, MotionModel
+from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
+from fieldpose.stages.tracking.retrieved import RetrievedPoses
+from fieldpose.stages.tracking.scoring import score
+from fieldpose.stages.tracking.trust import Trust
+from fieldpose.stages.tracking.views import Keyframes, Relocaliser, TrainingViews
 
 _NEAR_POSES = 4
 

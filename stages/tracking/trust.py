@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bus.messages import TrackingState
+from fieldpose.bus.messages import TrackingState
 
 
 class Trust:

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.errors import ConfigError
-from stages.nerf.datasets import find_name
-from stages.nerf.field import DESCRIBED_SIZE, Field
-from stages.tracking.distance import Limit, centres_of, pairwise
+from fieldpose.stages.errors import ConfigError
+from fieldpose.stages.nerf.datasets import find_name
+from fieldpose.stages.nerf.field import DESCRIBED_SIZE, Field
+from fieldpose.stages.tracking.distance import Limit, centres_of, pairwise
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,12 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from bus.messages import Frame, Guess, Pose, State
-from bus.node import Output, first_header
-from bus.topics import GUESS, STATE
-from stages.geometry import is_rigid
-from stages.tracking import core
-from stages.tracking.policy import FrameInfo, PoseResult
+from fieldpose.bus.messages import Frame, Guess, Pose, State
+from fieldpose.bus.node import Output, first_header
+from fieldpose.bus.topics import GUESS, STATE
+from fieldpose.stages.geometry import is_rigid
+from fieldpose.stages.tracking import core
+from fieldpose.stages.tracking.policy import FrameInfo, PoseResult
 
 _RIGID_TOLERANCE = 1e-3
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from bus.transport import Bus, MemoryBus, ZenohBus
+from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus
 
 ROOT = Path(__file__).parents[2]
 

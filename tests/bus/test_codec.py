@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from support.bus_samples import every_message, frame, guess, matches, same, view
 
-from bus import messages, topics
-from bus.codec import DTYPES, decode, encode
-from bus.errors import CodecError
-from bus.messages import Message
-from bus.topics import Topic
+from fieldpose.bus import messages, topics
+from fieldpose.bus.codec import DTYPES, decode, encode
+from fieldpose.bus.errors import CodecError
+from fieldpose.bus.messages import Message
+from fieldpose.bus.topics import Topic
 
 SAMPLES = every_message()
 PAYLOADS = {topic: encode(message) for topic, message in SAMPLES.items()}

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bus.codec import decode_header, encode
-from bus.errors import CodecError
-from bus.messages import CameraModel, Frame, Header, Truth
+from fieldpose.bus.codec import decode_header, encode
+from fieldpose.bus.errors import CodecError
+from fieldpose.bus.messages import CameraModel, Frame, Header, Truth
 
 HEADER = Header("camera", 3, 17, 0, 123, 456)
 

@@ -13,11 +13,11 @@ from itertools import pairwise
 import pytest
 from support.bus_samples import ADDRESS, frame, guess, matches, view
 
-from bus.messages import Header, Matches, Message, Reason, Stats
-from bus.node import EndOfInput, Handler, JoinedHandler, Output, reply_header, run_node
-from bus.ports import Inbox, Outbox, Received
-from bus.topics import FRAME, GUESS, MATCHES, STATS, TRUTH, VIEW, Topic
-from bus.transport import MemoryBus, ZenohBus, wait_for
+from fieldpose.bus.messages import Header, Matches, Message, Reason, Stats
+from fieldpose.bus.node import EndOfInput, Handler, JoinedHandler, Output, reply_header, run_node
+from fieldpose.bus.ports import Inbox, Outbox, Received
+from fieldpose.bus.topics import FRAME, GUESS, MATCHES, STATS, TRUTH, VIEW, Topic
+from fieldpose.bus.transport import MemoryBus, ZenohBus, wait_for
 
 Connect = Callable[[str], ZenohBus]
 Spawn = Callable[..., "subprocess.Popen[str]"]
@@ -348,9 +348,9 @@ class TestStats:
 
 STAGE = """
     import sys, time
-    from bus.node import run_node
-    from bus.topics import GUESS
-    from bus.transport import ZenohBus
+    from fieldpose.bus.node import run_node
+    from fieldpose.bus.topics import GUESS
+    from fieldpose.bus.transport import ZenohBus
     from support.bus_samples import ADDRESS
 
     class Stage:

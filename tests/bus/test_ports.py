@@ -7,12 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.bus_samples import ADDRESS, frame, guess, truth, view
 
-from bus.errors import CodecError
-from bus.joining import Joiner
-from bus.messages import Header
-from bus.ports import Inbox, Outbox, Sequences, reply_header
-from bus.topics import FRAME, GUESS, TRUTH, VIEW, Topic
-from bus.transport import MemoryBus
+from fieldpose.bus.errors import CodecError
+from fieldpose.bus.joining import Joiner
+from fieldpose.bus.messages import Header
+from fieldpose.bus.ports import Inbox, Outbox, Sequences, reply_header
+from fieldpose.bus.topics import FRAME, GUESS, TRUTH, VIEW, Topic
+from fieldpose.bus.transport import MemoryBus
 
 SECOND_NS = 10**9
 

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from bus.presence import MAX_BYTES, Presence
+from fieldpose.bus.presence import MAX_BYTES, Presence
 
 
 class Links:

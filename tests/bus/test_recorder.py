@@ -14,14 +14,14 @@ import pytest
 from mcap.reader import make_reader
 from support.bus_samples import ADDRESS, every_message, frame, guess, same, truth
 
-from bus.codec import encode
-from bus.errors import RecordingError
-from bus.messages import Header
-from bus.ports import Inbox, Outbox
-from bus.recorder import RECORDED, Recorder, RecorderHandler, RecordingWriter, partial_path, recover
-from bus.replay import Attachment, info, read_recording
-from bus.topics import ALL, FRAME, GUESS, STATS, TRUTH, Address
-from bus.transport import Bus, MemoryBus, ZenohBus, wait_for
+from fieldpose.bus.codec import encode
+from fieldpose.bus.errors import RecordingError
+from fieldpose.bus.messages import Header
+from fieldpose.bus.ports import Inbox, Outbox
+from fieldpose.bus.recorder import RECORDED, Recorder, RecorderHandler, RecordingWriter, partial_path, recover
+from fieldpose.bus.replay import Attachment, info, read_recording
+from fieldpose.bus.topics import ALL, FRAME, GUESS, STATS, TRUTH, Address
+from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus, wait_for
 
 Connect = Callable[[str], ZenohBus]
 Spawn = Callable[..., "subprocess.Popen[str]"]
@@ -166,10 +166,10 @@ class TestFile:
 
 RECORD = """
     import sys
-    from bus.node import run_node
-    from bus.recorder import RecorderHandler
-    from bus.topics import Address
-    from bus.transport import ZenohBus
+    from fieldpose.bus.node import run_node
+    from fieldpose.bus.recorder import RecorderHandler
+    from fieldpose.bus.topics import Address
+    from fieldpose.bus.transport import ZenohBus
     from support.bus_samples import ADDRESS
 
     bus = ZenohBus(sys.argv[1])

@@ -14,10 +14,10 @@ from typing import TypeVar
 import pytest
 from support.bus_samples import ADDRESS, frame, guess, same, truth
 
-from bus.errors import TransportError
-from bus.ports import Inbox, Outbox
-from bus.topics import FRAME, GUESS, STATS, TRUTH, Address
-from bus.transport import Bus, MemoryBus, ZenohBus, serve_hub, wait_for
+from fieldpose.bus.errors import TransportError
+from fieldpose.bus.ports import Inbox, Outbox
+from fieldpose.bus.topics import FRAME, GUESS, STATS, TRUTH, Address
+from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus, serve_hub, wait_for
 
 T = TypeVar("T")
 
@@ -193,10 +193,10 @@ class TestKeys:
 
 HOLDER = """
     import sys, time
-    from bus.transport import ZenohBus
+    from fieldpose.bus.transport import ZenohBus
     from support.bus_samples import ADDRESS, frame
-    from bus.ports import Outbox
-    from bus.topics import FRAME
+    from fieldpose.bus.ports import Outbox
+    from fieldpose.bus.topics import FRAME
     bus = ZenohBus(sys.argv[1])
     bus.hold(ADDRESS.live("camera"))
     outbox = Outbox(bus, ADDRESS, "camera")
@@ -294,7 +294,7 @@ class TestProcesses:
     def test_zenoh_logs_to_stderr_and_prints_stay_on_stdout(self, endpoint: str, spawn: Spawn) -> None:
         program = """
             import sys
-            from bus.transport import ZenohBus, log_to_stderr
+            from fieldpose.bus.transport import ZenohBus, log_to_stderr
             log_to_stderr("warn")
             print("before", flush=True)
             ZenohBus(sys.argv[1]).close()

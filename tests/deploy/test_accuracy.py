@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
-from deploy.accuracy import in_words, pose_accuracy
-from deploy.settings import Settings, changed
-from deploy.single import PoseFinder
-from stages.geometry import perturb
-from stages.nerf.metadata import PoseAccuracy
-from stages.tracking.views import TrainingViews
+from fieldpose.deploy.evaluation.accuracy import in_words, pose_accuracy
+from fieldpose.deploy.local import PoseFinder
+from fieldpose.deploy.settings import Settings, changed
+from fieldpose.stages.geometry import perturb
+from fieldpose.stages.nerf.metadata import PoseAccuracy
+from fieldpose.stages.tracking.views import TrainingViews
 
 SETTINGS = changed(Settings(), {"matching": {"matcher": "sift"}}, "test")
 SEEN_BY = camera(160)

@@ -10,13 +10,21 @@ import pytest
 import torch
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
-from deploy.settings import Settings
-from stages.geometry import Camera, camera_centre, exp_se3, inverse, perturb, rotation_error_deg, translation_error
-from stages.matching.core import MatchingConfig
-from tests.benchmark.baselines import BASELINES, Essential, Inerf, InerfConfig, PiNerf, PiNerfConfig
-from tests.benchmark.baselines.descent import left_jacobian
-from tests.benchmark.baselines.inerf import interest_region, squared_error
-from tests.benchmark.baselines.pinerf import Hypotheses, Target, errors, loss, resampled
+from fieldpose.deploy.evaluation.baselines import BASELINES, Essential, Inerf, InerfConfig, PiNerf, PiNerfConfig
+from fieldpose.deploy.evaluation.baselines.descent import left_jacobian
+from fieldpose.deploy.evaluation.baselines.inerf import interest_region, squared_error
+from fieldpose.deploy.evaluation.baselines.pinerf import Hypotheses, Target, errors, loss, resampled
+from fieldpose.deploy.settings import Settings
+from fieldpose.stages.geometry import (
+    Camera,
+    camera_centre,
+    exp_se3,
+    inverse,
+    perturb,
+    rotation_error_deg,
+    translation_error,
+)
+from fieldpose.stages.matching.core import MatchingConfig
 
 CAMERA = camera(160)
 POSE = viewpoint()

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from support import posed_images
 
-from deploy.cli import main
-from stages.nerf.config import FieldConfig, TrainingConfig
-from stages.nerf.from_dataset import train_field
+from fieldpose.deploy.cli import main
+from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
+from fieldpose.stages.nerf.from_dataset import train_field
 
 SMALL = FieldConfig(levels=2, log2_table=8, hidden=8, colour_hidden=8, occupancy_resolution=16, finest_resolution=32)
 MODEL = ["--model.levels", 2, "--model.log2-table", 8, "--model.occupancy-resolution", 16]

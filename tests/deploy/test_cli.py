@@ -13,9 +13,9 @@ import pytest
 from safetensors.numpy import save_file
 from support.commands import fieldpose, save_empty_field
 
-from deploy.cli import COMMANDS, main, parse
-from deploy.commands import run, stage
-from deploy.errors import UsageError
+from fieldpose.deploy.cli import COMMANDS, main, parse
+from fieldpose.deploy.commands import run, stage
+from fieldpose.deploy.errors import UsageError
 
 
 @pytest.fixture
@@ -65,8 +65,8 @@ def test_mistakes_are_one_line_and_exit_code_2(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     # These change this very process.
-    monkeypatch.setattr("deploy.commands.stage.log_to_stderr", lambda: None)
-    monkeypatch.setattr("deploy.commands.stage.thread_environment", lambda threads: {})
+    monkeypatch.setattr("fieldpose.deploy.commands.stage.log_to_stderr", lambda: None)
+    monkeypatch.setattr("fieldpose.deploy.commands.stage.thread_environment", lambda threads: {})
     assert main(arguments) == 2
     line = only_line(capsys)
     assert line.startswith("fieldpose: ")
@@ -186,7 +186,7 @@ def test_in_real_processes_missing_weights_are_told(field: Path, tmp_path: Path)
 def test_doctor_finds_what_is_missing_and_writes_its_findings(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from deploy import checks
+    from fieldpose.deploy import checks
 
     monkeypatch.setattr(checks, "weights", lambda: iter(()))
     path = tmp_path / "findings.json"

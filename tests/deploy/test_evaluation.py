@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bus.messages import Reason
-from deploy.cli import main
-from deploy.commands.evaluate import in_short
-from deploy.evaluation.methods import Method
-from deploy.evaluation.pairs import PROTOCOLS, Pair, draw
-from deploy.evaluation.running import Examination
-from deploy.evaluation.scores import Answer, curve, difference, score, share_of_solvable
-from deploy.scene import demo_file
-from deploy.single import PoseFound
-from stages.geometry import camera_centre, exp_se3, look_at, rotation_about
+from fieldpose.bus.messages import Reason
+from fieldpose.deploy.cli import main
+from fieldpose.deploy.commands.evaluate import in_short
+from fieldpose.deploy.evaluation.methods import Method
+from fieldpose.deploy.evaluation.pairs import PROTOCOLS, Pair, draw
+from fieldpose.deploy.evaluation.running import Examination
+from fieldpose.deploy.evaluation.scores import Answer, curve, difference, score, share_of_solvable
+from fieldpose.deploy.local import PoseFound
+from fieldpose.deploy.scene import demo_file
+from fieldpose.stages.geometry import camera_centre, exp_se3, look_at, rotation_about
 
 TRUTHS = [look_at((4 * np.cos(a), 4 * np.sin(a), 1.0), (0, 0, 0), (0, 0, 1)) for a in np.arange(7.0)]
 
@@ -263,10 +263,10 @@ def test_methods_take_turns_image_by_image_and_what_there_is_is_written(
 
     monkeypatch.setattr(Examination, "answers", noted)
     methods = {"quick": Method(lambda *given: Nowhere()), "slow": Method(lambda *given: Nowhere(), slow=True)}
-    monkeypatch.setattr("deploy.evaluation.methods.METHODS", methods)
-    monkeypatch.setattr("deploy.evaluation.running.METHODS", methods)
-    monkeypatch.setattr("deploy.commands.evaluate._WRITTEN_EVERY_S", -1.0)
-    monkeypatch.setattr("deploy.commands.evaluate.write_json", lambda path, figures: written.append(figures))
+    monkeypatch.setattr("fieldpose.deploy.evaluation.methods.METHODS", methods)
+    monkeypatch.setattr("fieldpose.deploy.evaluation.running.METHODS", methods)
+    monkeypatch.setattr("fieldpose.deploy.commands.evaluate._WRITTEN_EVERY_S", -1.0)
+    monkeypatch.setattr("fieldpose.deploy.commands.evaluate.write_json", lambda path, figures: written.append(figures))
     field = demo_file("field.safetensors")
     arguments = ["evaluate", field, field.parent, "--method", "all", "--seeds", 0, "--images", 2, "--poses", 2]
     arguments += ["--size", 100, "--slow-pairs", 2, "--json", tmp_path / "scores.json"]

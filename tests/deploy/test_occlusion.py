@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.posed_images import centred, write_blender
 
-from deploy.evaluation.occlusion import Occlusion, objects_of, occluded, painted
-from deploy.scene import demo_file
-from stages.errors import DatasetError
-from stages.nerf.datasets import load_dataset
+from fieldpose.deploy.evaluation.occlusion import Occlusion, objects_of, occluded, painted
+from fieldpose.deploy.scene import demo_file
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.nerf.datasets import load_dataset
 
 GREY = np.full((120, 160, 3), 99, np.uint8)
 

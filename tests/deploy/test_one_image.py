@@ -13,18 +13,18 @@ import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 from support.pictures import needs
 
-from bus.messages import Reason
-from deploy.cli import main
-from deploy.scene import demo_file
-from deploy.settings import Settings, changed
-from deploy.single import PoseFinder
-from stages.errors import WeightsError
-from stages.geometry import perturb, rotation_error_deg, translation_error
-from stages.nerf.datasets import load_dataset
-from stages.nerf.field import load_field
-from stages.nerf.loading import make_renderer
-from stages.nerf.rendering_api import RayRenderer, RenderedRays, RenderedView
-from stages.tracking.views import TrainingViews, training_views
+from fieldpose.bus.messages import Reason
+from fieldpose.deploy.cli import main
+from fieldpose.deploy.local import PoseFinder
+from fieldpose.deploy.scene import demo_file
+from fieldpose.deploy.settings import Settings, changed
+from fieldpose.stages.errors import WeightsError
+from fieldpose.stages.geometry import perturb, rotation_error_deg, translation_error
+from fieldpose.stages.nerf.datasets import load_dataset
+from fieldpose.stages.nerf.field import load_field
+from fieldpose.stages.nerf.loading import make_renderer
+from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedRays, RenderedView
+from fieldpose.stages.tracking.views import TrainingViews, training_views
 
 NO_VIEWS = TrainingViews((), np.zeros((0, 4, 4)))
 SETTINGS = changed(Settings(), {"matching": {"matcher": "sift"}, "refinement": {"steps": 0}}, "test")
@@ -115,7 +115,7 @@ def test_a_guess_needs_no_weights_of_retrievals(scene: AnalyticScene, monkeypatc
     def no_weights(*arguments: object) -> None:
         raise WeightsError("no weights xfeat.pt")
 
-    monkeypatch.setattr("deploy.lookalikes.describer", no_weights)
+    monkeypatch.setattr("fieldpose.deploy.lookalikes.describer", no_weights)
     views = TrainingViews(("a",), viewpoint()[None], np.ones((1, 8, 64), np.int8))
     finder, blank = PoseFinder(scene, SETTINGS, views), np.full((120, 120, 3), 255, np.uint8)
     with pytest.raises(WeightsError):

@@ -15,14 +15,13 @@ import pytest
 from support.commands import command
 from support.pictures import needs
 
-from bus.replay import info
-from bus.topics import ALL
-from deploy.cli import main
-from deploy.pipeline import Plan, Progress, programs
-from deploy.processes import CAMERA, HUB, OBSERVER, RECORDER, STAGES, TABLE, thread_environment, threads_of
-from deploy.scene import demo_file
-from deploy.settings import Settings
-from deploy.supervision import child_environment
+from fieldpose.bus.replay import info
+from fieldpose.bus.topics import ALL
+from fieldpose.deploy.cli import main
+from fieldpose.deploy.graph import CAMERA, HUB, OBSERVER, RECORDER, STAGES, TABLE, thread_environment, threads_of
+from fieldpose.deploy.processes.pipeline import Plan, Progress, programs
+from fieldpose.deploy.scene import demo_file
+from fieldpose.deploy.settings import Settings
 
 FRAMES = 8
 SMALL = [
@@ -94,7 +93,7 @@ def test_a_stage_killed_in_the_demo_comes_back_and_the_recording_is_whole(
             killed.append(pid_of("rendering"))
             os.kill(killed[0], signal.SIGKILL)
 
-    monkeypatch.setattr("deploy.commands.demo.live_line", lambda title: nullcontext(kill_rendering))
+    monkeypatch.setattr("fieldpose.deploy.commands.demo.live_line", lambda title: nullcontext(kill_rendering))
     assert main(["demo", "--out", str(tmp_path), *SMALL]) == 0
     assert killed
     assert descendants() <= before
@@ -135,7 +134,6 @@ def test_ctrl_c_ends_every_process_within_5_s_and_leaves_a_finished_recording(tm
     arguments = ["--source", source, "--guess", "train:047", "--rendering.size", "128", "--record", str(recording)]
     running = subprocess.Popen(
         command("run", demo_file("field.safetensors"), *arguments, "--json", figures),
-        env=child_environment(),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,

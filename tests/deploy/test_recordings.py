@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 from support import bus_samples
 
-from bus.ports import Outbox
-from bus.replay import info
-from bus.topics import POSE, STATE, Address
-from bus.transport import ZenohBus, serve_hub
-from deploy.cli import main
-from deploy.endpoints import free_port
+from fieldpose.bus.ports import Outbox
+from fieldpose.bus.replay import info
+from fieldpose.bus.topics import POSE, STATE, Address
+from fieldpose.bus.transport import ZenohBus, serve_hub
+from fieldpose.deploy.cli import main
+from fieldpose.deploy.processes.endpoints import free_port
 
 ADDRESS = Address("fieldpose", "mug", "cam")
 
@@ -65,7 +65,7 @@ def test_record_then_info(talking: str, tmp_path: Path, capsys: pytest.CaptureFi
 def test_recording_where_no_hub_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("deploy.commands.record._HUB_S", 0.2)
+    monkeypatch.setattr("fieldpose.deploy.commands.record._HUB_S", 0.2)
     hub = f"tcp/127.0.0.1:{free_port()}"
     assert main(["record", str(tmp_path / "a.mcap"), "--connect", hub, "--seconds", "1"]) == 2
     assert f"no hub answers at {hub}" in capsys.readouterr().err

@@ -12,14 +12,26 @@ import numpy as np
 import pytest
 from support import bus_samples
 
-from bus.memory import MemoryBus
-from bus.messages import Header, Pose, Reason, State, TrackingState
-from bus.ports import Outbox, first_header
-from bus.replay import RecordingInfo, SourceInfo, TopicInfo
-from bus.topics import CORRESPONDENCES, ESTIMATE, FRAME, GUESS, MATCHES, POSE, STATE, STATS, TRUTH, VIEW, Address
-from deploy.collector import Collector
-from deploy.results import FrameResult, RunResult, TruthKnown, accuracy, rate_hz, summarise, to_csv
-from stages.geometry import exp_se3
+from fieldpose.bus.memory import MemoryBus
+from fieldpose.bus.messages import Header, Pose, Reason, State, TrackingState
+from fieldpose.bus.ports import Outbox, first_header
+from fieldpose.bus.replay import RecordingInfo, SourceInfo, TopicInfo
+from fieldpose.bus.topics import (
+    CORRESPONDENCES,
+    ESTIMATE,
+    FRAME,
+    GUESS,
+    MATCHES,
+    POSE,
+    STATE,
+    STATS,
+    TRUTH,
+    VIEW,
+    Address,
+)
+from fieldpose.deploy.processes.collector import Collector
+from fieldpose.deploy.reporting.results import FrameResult, RunResult, TruthKnown, accuracy, rate_hz, summarise, to_csv
+from fieldpose.stages.geometry import exp_se3
 
 ADDRESS = Address("test", "mug", "cam")
 

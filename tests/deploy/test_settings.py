@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from deploy.settings import Settings, changed, read_file, read_settings, to_json
-from stages.errors import ConfigError
+from fieldpose.deploy.settings import Settings, changed, read_file, read_settings, to_json
+from fieldpose.stages.errors import ConfigError
 
 
 def written(path: Path, text: str) -> Path:

@@ -10,15 +10,15 @@ import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 from support.chain import frame_message
 
-from bus.messages import Header
-from bus.recording import RecordingWriter
-from bus.topics import FRAME, Address
-from deploy.errors import OutputError
-from deploy.output import check_writable, write_bytes, write_json
-from deploy.overlay import EDGE_RGB, encoded, overlaid
-from deploy.results import FrameResult, TruthKnown
-from deploy.showing import pictures, write_video
-from stages.geometry import perturb
+from fieldpose.bus.messages import Header
+from fieldpose.bus.recording import RecordingWriter
+from fieldpose.bus.topics import FRAME, Address
+from fieldpose.deploy.errors import OutputError
+from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
+from fieldpose.deploy.reporting.overlay import EDGE_RGB, encoded, overlaid
+from fieldpose.deploy.reporting.results import FrameResult, TruthKnown
+from fieldpose.deploy.reporting.showing import pictures, write_video
+from fieldpose.stages.geometry import perturb
 
 CAMERA = camera(64)
 FRAME_NS = 100_000_000

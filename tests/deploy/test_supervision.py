@@ -13,8 +13,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from deploy.errors import ProcessError
-from deploy.supervision import USER_ERROR, Program, Supervisor, child_environment
+from fieldpose.deploy.errors import ProcessError
+from fieldpose.deploy.processes.supervision import USER_ERROR, Program, Supervisor
 
 SLEEP = "import time; print('up', flush=True); time.sleep(60)"
 STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {SLEEP}"
@@ -86,7 +86,7 @@ def test_all_end_when_whoever_started_them_is_killed(tmp_path: Path) -> None:
     code = f"""
 import sys, time
 from pathlib import Path
-from deploy.supervision import Program, Supervisor
+from fieldpose.deploy.processes.supervision import Program, Supervisor
 if __name__ == "__main__":
     with Supervisor(Path({str(tmp_path)!r}), [Program("a", [sys.executable, "-c", {SLEEP!r}])]) as supervisor:
         while not supervisor.poll()["a"].pid:
@@ -94,7 +94,7 @@ if __name__ == "__main__":
         print(supervisor.poll()["a"].pid, flush=True)
         time.sleep(60)
 """
-    parent = subprocess.Popen([sys.executable, "-c", code], env=child_environment(), stdout=subprocess.PIPE, text=True)
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     child = int(parent.stdout.readline())
     parent.kill()

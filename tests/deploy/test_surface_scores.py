@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
-from deploy.evaluation.surface import Surface, add, add_s, area_under_curve, read_surface, surface_of
-from stages.errors import DatasetError
-from stages.geometry import camera_centre, look_at, rotation_about
-from stages.nerf.metadata import TrainingCamera
+from fieldpose.deploy.evaluation.surface import Surface, add, add_s, area_under_curve, read_surface, surface_of
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.geometry import camera_centre, look_at, rotation_about
+from fieldpose.stages.nerf.metadata import TrainingCamera
 
 SQUARE = Surface(np.array([[1.0, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]]))
 

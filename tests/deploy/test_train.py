@@ -9,10 +9,10 @@ import pytest
 from support import posed_images
 from support.pictures import needs
 
-from deploy.cli import main
-from stages.errors import WeightsError
-from stages.nerf.field import load_field
-from stages.nerf.metadata import PoseAccuracy
+from fieldpose.deploy.cli import main
+from fieldpose.stages.errors import WeightsError
+from fieldpose.stages.nerf.field import load_field
+from fieldpose.stages.nerf.metadata import PoseAccuracy
 
 SMALL = [
     "--model.levels", "2", "--model.log2-table", "8", "--model.hidden", "8", "--model.colour-hidden", "8",
@@ -55,7 +55,7 @@ def test_without_weights_a_field_is_learnt_that_remembers_nothing(
     def nowhere(*arguments: object) -> Path:
         raise WeightsError("no weights xfeat.pt: give their path")
 
-    monkeypatch.setattr("stages.matching.xfeat.find_weights", nowhere)
+    monkeypatch.setattr("fieldpose.stages.matching.xfeat.find_weights", nowhere)
     posed_images.write_blender(tmp_path / "data", posed_images.centred(32, 32, 40.0))
     out = tmp_path / "field.safetensors"
     arguments = ["train", str(tmp_path / "data"), "--out", str(out), "--size", "16", "--training.steps", "1"]
@@ -82,7 +82,7 @@ def test_how_well_training_images_are_found_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = PoseAccuracy(images=32, found=31, rotation_deg=0.02, translation=0.001, error_scale=1.2)
-    monkeypatch.setattr("deploy.accuracy.pose_accuracy", lambda renderer, views, images, cameras, settings: told)
+    monkeypatch.setattr("fieldpose.deploy.evaluation.accuracy.pose_accuracy", lambda *arguments: told)
     posed_images.write_blender(tmp_path / "data", posed_images.centred(32, 32, 40.0))
     out, figures = tmp_path / "field.safetensors", tmp_path / "train.json"
     arguments = ["train", str(tmp_path / "data"), "--out", str(out), "--training.steps", "1", "--json", str(figures)]

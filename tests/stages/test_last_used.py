@@ -1,7 +1,7 @@
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.last_used import LastUsed
+from fieldpose.stages.last_used import LastUsed
 
 
 @settings(max_examples=80, deadline=None)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from stages.geometry import Camera, look_at, rays
-from stages.nerf.rendering_api import RenderedRays, RenderedView
+from fieldpose.stages.geometry import Camera, look_at, rays
+from fieldpose.stages.nerf.rendering_api import RenderedRays, RenderedView
 
 SPHERES = (((0.55, 0.1, 0.15), 0.5), ((-0.2, 0.75, -0.25), 0.35))
 BOXES = (((-0.95, -0.7, -0.6), (-0.05, 0.3, 0.5)), ((-1.1, -1.1, -0.75), (1.2, 1.2, -0.6)))

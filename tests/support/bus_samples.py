@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from bus import topics
-from bus.messages import (
+from fieldpose.bus import topics
+from fieldpose.bus.messages import (
     CameraModel,
     Correspondences,
     Estimate,
@@ -26,8 +26,8 @@ from bus.messages import (
     Truth,
     View,
 )
-from bus.ports import first_header
-from bus.topics import Address, Topic
+from fieldpose.bus.ports import first_header
+from fieldpose.bus.topics import Address, Topic
 
 ADDRESS = Address("test", "mug", "cam")
 CAMERA = CameraModel(6, 4, 5.0, 5.0, 2.5, 1.5, (0.1, 0.0, 0.0, 0.0, -0.2))

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from bus.codec import decode, encode
-from bus.messages import Frame, Guess, GuessReason, Message
-from bus.node import JoinedHandler, Output, first_header
-from bus.topics import FRAME, GUESS, Topic
-from stages.geometry import Camera
-from stages.wire import camera_model
+from fieldpose.bus.codec import decode, encode
+from fieldpose.bus.messages import Frame, Guess, GuessReason, Message
+from fieldpose.bus.node import JoinedHandler, Output, first_header
+from fieldpose.bus.topics import FRAME, GUESS, Topic
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.wire import camera_model
 
 
 def frame_message(image: np.ndarray, camera: Camera, frame_id: int = 1, encoding: Any = "rgb8") -> Frame:

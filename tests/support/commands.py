@@ -8,21 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.supervision import child_environment
-from stages.nerf.config import FieldConfig
-from stages.nerf.field import Field, new_net
-from stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
+from fieldpose.stages.nerf.config import FieldConfig
+from fieldpose.stages.nerf.field import Field, new_net
+from fieldpose.stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
 
 
 def command(*arguments: object) -> list[str]:
     """The command line of `fieldpose`."""
-    return [sys.executable, "-P", "-m", "deploy", *(str(argument) for argument in arguments)]
+    return [sys.executable, "-P", "-m", "fieldpose", *(str(argument) for argument in arguments)]
 
 
 def fieldpose(*arguments: object, cwd: Path, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
     """Run `fieldpose` in a folder, to its end."""
     return subprocess.run(
-        command(*arguments), cwd=cwd, env=child_environment(), timeout=timeout_s, capture_output=True, text=True
+        command(*arguments), cwd=cwd, timeout=timeout_s, capture_output=True, text=True
     )
 
 

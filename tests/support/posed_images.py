@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from stages.geometry import Camera, inverse, look_at
+from fieldpose.stages.geometry import Camera, inverse, look_at
 
 POINT = np.array([0.25, -0.15, 0.2])
 CAMERA = Camera(96, 64, 110.0, 108.0, 46.0, 33.5)

@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from bus.messages import GuessReason, TrackingState
-from stages.geometry import exp_se3, look_at, perturb, rotation_error_deg, translation_error
-from stages.tracking.core import GuessOrder, StateReport, Tracker
-from stages.tracking.distance import Limit
-from stages.tracking.policy import FrameInfo, PoseResult
-from stages.tracking.views import TrainingViews
+from fieldpose.bus.messages import GuessReason, TrackingState
+from fieldpose.stages.geometry import exp_se3, look_at, perturb, rotation_error_deg, translation_error
+from fieldpose.stages.tracking.core import GuessOrder, StateReport, Tracker
+from fieldpose.stages.tracking.distance import Limit
+from fieldpose.stages.tracking.policy import FrameInfo, PoseResult
+from fieldpose.stages.tracking.views import TrainingViews
 
 MS = 1_000_000
 FRAME_MS = 1000 / 30

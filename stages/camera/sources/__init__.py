@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from stages.camera.config import CameraConfig
-from stages.camera.core import Source
-from stages.camera.sources.dataset import open_dataset
-from stages.camera.sources.device import open_device
-from stages.camera.sources.folder import open_folder
-from stages.camera.sources.recording import open_recording
-from stages.camera.sources.video import open_video
-from stages.errors import SourceError
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.core import Source
+from fieldpose.stages.camera.sources.dataset import open_dataset
+from fieldpose.stages.camera.sources.device import open_device
+from fieldpose.stages.camera.sources.folder import open_folder
+from fieldpose.stages.camera.sources.recording import open_recording
+from fieldpose.stages.camera.sources.video import open_video
+from fieldpose.stages.errors import SourceError
 
 
 class Kind(NamedTuple):

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import cast, get_args
 
-from stages.camera.config import CameraConfig
-from stages.camera.core import CapturedFrame, Source, TruePose
-from stages.errors import SourceError
-from stages.nerf.datasets import load_dataset
-from stages.nerf.datasets.assemble import Split
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.core import CapturedFrame, Source, TruePose
+from fieldpose.stages.errors import SourceError
+from fieldpose.stages.nerf.datasets import load_dataset
+from fieldpose.stages.nerf.datasets.assemble import Split
 
 
 def open_dataset(rest: str, config: CameraConfig) -> Source:

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from stages.camera.calibration import calibrate, shrunk
-from stages.camera.config import CameraConfig
-from stages.camera.core import CapturedFrame, Source
-from stages.errors import DatasetError, SourceError
-from stages.nerf.datasets.images import EXTENSIONS, load_pixels, over_background, probe
+from fieldpose.stages.camera.calibration import calibrate, shrunk
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.core import CapturedFrame, Source
+from fieldpose.stages.errors import DatasetError, SourceError
+from fieldpose.stages.nerf.datasets.images import EXTENSIONS, load_pixels, over_background, probe
 
 _ORIENTATION = 0x0112
 

@@ -11,15 +11,15 @@ import cv2
 import msgspec
 import numpy as np
 
-from bus.errors import RecordingError
-from bus.messages import Frame, Truth
-from bus.replay import Recorded, read_recording
-from bus.topics import FRAME, TRUTH
-from stages.camera.calibration import shrunk
-from stages.camera.config import CameraConfig
-from stages.camera.core import CapturedFrame, Source, TruePose
-from stages.errors import SourceError
-from stages.geometry import Camera
+from fieldpose.bus.errors import RecordingError
+from fieldpose.bus.messages import Frame, Truth
+from fieldpose.bus.replay import Recorded, read_recording
+from fieldpose.bus.topics import FRAME, TRUTH
+from fieldpose.stages.camera.calibration import shrunk
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.core import CapturedFrame, Source, TruePose
+from fieldpose.stages.errors import SourceError
+from fieldpose.stages.geometry import Camera
 
 _TRUTH_MAY_LAG = 4
 _TRUTHS_KEPT = 64

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import cv2
 
-from stages.camera.calibration import calibrate, shrunk
-from stages.camera.config import CameraConfig
-from stages.camera.core import CapturedFrame, Source
-from stages.camera.sources.capture import opened
-from stages.errors import SourceError
-from stages.geometry import Camera
+from fieldpose.stages.camera.calibration import calibrate, shrunk
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.core import CapturedFrame, Source
+from fieldpose.stages.camera.sources.capture import opened
+from fieldpose.stages.errors import SourceError
+from fieldpose.stages.geometry import Camera
 
 _FALLBACK_FPS = 30.0
 

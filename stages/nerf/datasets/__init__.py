@@ -1,8 +1,8 @@
 """Readers of posed photographs: NeRF-synthetic, transforms.json and LLFF, behind one load_dataset."""
 
-from stages.errors import DatasetError
-from stages.nerf.datasets.bounds import SceneBounds
-from stages.nerf.datasets.loader import load_dataset
-from stages.nerf.datasets.records import Dataset, ImageRecord, find_name
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.nerf.datasets.bounds import SceneBounds
+from fieldpose.stages.nerf.datasets.loader import load_dataset
+from fieldpose.stages.nerf.datasets.records import Dataset, ImageRecord, find_name
 
 __all__ = ["Dataset", "DatasetError", "ImageRecord", "SceneBounds", "find_name", "load_dataset"]

@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from stages.errors import DatasetError
-from stages.nerf.datasets import images
-from stages.nerf.datasets.bounds import SceneBounds, box_bounds, object_bounds, unbounded_bounds
-from stages.nerf.datasets.records import Dataset, ImageRecord, Kind, Scene
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.nerf.datasets import images
+from fieldpose.stages.nerf.datasets.bounds import SceneBounds, box_bounds, object_bounds, unbounded_bounds
+from fieldpose.stages.nerf.datasets.records import Dataset, ImageRecord, Kind, Scene
 
 Holdout = Literal["auto", "odd", "every8"]
 Split = Literal["train", "test", "all"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from stages.nerf.datasets.assemble import Draft
-from stages.nerf.datasets.frames import check_distinct, read_document, read_records
+from fieldpose.stages.nerf.datasets.assemble import Draft
+from fieldpose.stages.nerf.datasets.frames import check_distinct, read_document, read_records
 
 TRAIN_FILE, TEST_FILE = "transforms_train.json", "transforms_test.json"
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stages.geometry.cameras import Camera
-from stages.geometry.rigid import camera_centre
+from fieldpose.stages.geometry.cameras import Camera
+from fieldpose.stages.geometry.rigid import camera_centre
 
 _AROUND_THE_VIEW = 1.05
 _AROUND_THE_CAMERAS = 1.05

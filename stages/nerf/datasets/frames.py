@@ -10,11 +10,11 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from stages.errors import DatasetError
-from stages.geometry.rigid import inverse, is_rigid, nearest_rigid
-from stages.nerf.datasets.images import EXTENSIONS, ImageHeader, probe
-from stages.nerf.datasets.intrinsics import Intrinsics, camera_of
-from stages.nerf.datasets.records import ImageRecord
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.geometry.rigid import inverse, is_rigid, nearest_rigid
+from fieldpose.stages.nerf.datasets.images import EXTENSIONS, ImageHeader, probe
+from fieldpose.stages.nerf.datasets.intrinsics import Intrinsics, camera_of
+from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 RIGID_TOLERANCE = 1e-3
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

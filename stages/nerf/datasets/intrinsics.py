@@ -7,9 +7,9 @@ import math
 import msgspec
 import numpy as np
 
-from stages.errors import DatasetError, StageError
-from stages.geometry.cameras import Camera
-from stages.nerf.datasets.images import ImageHeader
+from fieldpose.stages.errors import DatasetError, StageError
+from fieldpose.stages.geometry.cameras import Camera
+from fieldpose.stages.nerf.datasets.images import ImageHeader
 
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from stages.errors import DatasetError
-from stages.geometry.cameras import Camera
-from stages.geometry.rigid import from_rotation, inverse
-from stages.nerf.datasets.assemble import Draft, Holdout, split_of
-from stages.nerf.datasets.frames import OPENCV_FROM_OPENGL, checked_rigid, relative_name
-from stages.nerf.datasets.images import EXTENSIONS, probe
-from stages.nerf.datasets.records import ImageRecord
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.geometry.cameras import Camera
+from fieldpose.stages.geometry.rigid import from_rotation, inverse
+from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
+from fieldpose.stages.nerf.datasets.frames import OPENCV_FROM_OPENGL, checked_rigid, relative_name
+from fieldpose.stages.nerf.datasets.images import EXTENSIONS, probe
+from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 FILE = "poses_bounds.npy"
 BOUND_FACTOR = 0.75

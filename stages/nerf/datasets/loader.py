@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stages.errors import DatasetError
-from stages.nerf.datasets import blender, llff, transforms
-from stages.nerf.datasets.assemble import Draft, Holdout, Split, assemble
-from stages.nerf.datasets.records import Dataset
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.nerf.datasets import blender, llff, transforms
+from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, Split, assemble
+from fieldpose.stages.nerf.datasets.records import Dataset
 
 
 def load_dataset(

@@ -11,10 +11,10 @@ from typing import Literal
 
 import numpy as np
 
-from stages.errors import DatasetError
-from stages.geometry.cameras import Camera
-from stages.nerf.datasets import images
-from stages.nerf.datasets.bounds import SceneBounds
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.geometry.cameras import Camera
+from fieldpose.stages.nerf.datasets import images
+from fieldpose.stages.nerf.datasets.bounds import SceneBounds
 
 Kind = Literal["blender", "transforms", "llff"]
 Scene = Literal["object", "bounded", "unbounded"]

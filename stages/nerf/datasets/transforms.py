@@ -6,10 +6,10 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from stages.errors import DatasetError
-from stages.nerf.datasets.assemble import Draft, Holdout, split_of
-from stages.nerf.datasets.frames import Document, Frame, find_image, read_document, read_records
-from stages.nerf.datasets.records import ImageRecord
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
+from fieldpose.stages.nerf.datasets.frames import Document, Frame, find_image, read_document, read_records
+from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 FILE = "transforms.json"
 

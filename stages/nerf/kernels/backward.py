@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numba import njit
 
-from stages.fastmath import FASTMATH
-from stages.nerf.kernels.packet import MAX_EXPONENT
-from stages.nerf.kernels.types import Net, Rays, Samples
+from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.packet import MAX_EXPONENT
+from fieldpose.stages.nerf.kernels.types import Net, Rays, Samples
 
 FEW = 8
 """Moving the rows costs about as much as the backward pass of an eighth of them."""

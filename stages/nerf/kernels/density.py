@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.fastmath import FASTMATH
-from stages.nerf.kernels.packet import density, density_network
-from stages.nerf.kernels.types import Net, Samples
+from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.packet import density, density_network
+from fieldpose.stages.nerf.kernels.types import Net, Samples
 
 
 @njit(nogil=True, fastmath=FASTMATH, cache=True)

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.fastmath import FASTMATH
-from stages.nerf.kernels.types import Net, Samples
-from stages.nerf.kernels.vectors import BLOCK, WIDTH, blend4, dot4, spread4
+from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.types import Net, Samples
+from fieldpose.stages.nerf.kernels.vectors import BLOCK, WIDTH, blend4, dot4, spread4
 
 PRIME_Y = np.uint32(2654435761)
 PRIME_Z = np.uint32(805459861)

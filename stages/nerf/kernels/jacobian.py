@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.fastmath import FASTMATH
-from stages.nerf.kernels.backward import (
+from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.backward import (
     colour_backward,
     compact,
     composite_backward,
     density_backward,
     shade_backward,
 )
-from stages.nerf.kernels.encoding import position_gradients
-from stages.nerf.kernels.packet import forward, shade, surface
-from stages.nerf.kernels.space import cube_gradient
-from stages.nerf.kernels.types import SH_SIZE, Domain, Net, Rays, Samples
+from fieldpose.stages.nerf.kernels.encoding import position_gradients
+from fieldpose.stages.nerf.kernels.packet import forward, shade, surface
+from fieldpose.stages.nerf.kernels.space import cube_gradient
+from fieldpose.stages.nerf.kernels.types import SH_SIZE, Domain, Net, Rays, Samples
 
 
 @njit(nogil=True, fastmath=FASTMATH)

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numba import njit
 
-from stages.fastmath import FASTMATH
-from stages.nerf.kernels.space import BLOCK, clip, occupied, skip, to_cube
-from stages.nerf.kernels.types import Domain, Rays, Samples
+from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.space import BLOCK, clip, occupied, skip, to_cube
+from fieldpose.stages.nerf.kernels.types import Domain, Rays, Samples
 
 TINY, HUGE = np.float32(1e-9), np.float32(1e9)
 

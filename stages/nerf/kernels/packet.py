@@ -7,11 +7,11 @@ import math
 import numpy as np
 from numba import njit
 
-from stages.fastmath import FASTMATH
-from stages.nerf.kernels.encoding import encode
-from stages.nerf.kernels.march import advance, begin
-from stages.nerf.kernels.types import SH_SIZE, Domain, Net, Rays, Samples
-from stages.nerf.kernels.vectors import float_of_bits
+from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.encoding import encode
+from fieldpose.stages.nerf.kernels.march import advance, begin
+from fieldpose.stages.nerf.kernels.types import SH_SIZE, Domain, Net, Rays, Samples
+from fieldpose.stages.nerf.kernels.vectors import float_of_bits
 
 MAX_EXPONENT, MIN_EXPONENT = np.float32(11.0), np.float32(-80.0)
 HALF = np.float32(0.5)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from stages.fastmath import FASTMATH
-from stages.nerf.kernels.march import begin
-from stages.nerf.kernels.packet import forward, shade, surface, trace
-from stages.nerf.kernels.sight import narrow
-from stages.nerf.kernels.types import Domain, Net, Rays, Samples, Tiles
+from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.march import begin
+from fieldpose.stages.nerf.kernels.packet import forward, shade, surface, trace
+from fieldpose.stages.nerf.kernels.sight import narrow
+from fieldpose.stages.nerf.kernels.types import Domain, Net, Rays, Samples, Tiles
 
 
 @njit(nogil=True, fastmath=FASTMATH, cache=True)

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numba import njit
 
-from stages.fastmath import FASTMATH
-from stages.nerf.kernels.space import BLOCK
-from stages.nerf.kernels.types import Domain, Rays
+from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.space import BLOCK
+from fieldpose.stages.nerf.kernels.types import Domain, Rays
 
 NEVER = np.float32(np.inf)
 

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-from stages.fastmath import FASTMATH
-from stages.nerf.kernels.types import Domain
+from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.types import Domain
 
 BLOCK = 4
 """Cells along each side of a block."""

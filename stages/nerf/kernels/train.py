@@ -7,17 +7,17 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from stages.fastmath import FASTMATH
-from stages.nerf.kernels.backward import (
+from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.backward import (
     colour_backward,
     compact,
     composite_backward,
     density_backward,
     shade_backward,
 )
-from stages.nerf.kernels.encoding import scatter
-from stages.nerf.kernels.packet import forward, shade
-from stages.nerf.kernels.types import Domain, Net, Rays, Samples
+from fieldpose.stages.nerf.kernels.encoding import scatter
+from fieldpose.stages.nerf.kernels.packet import forward, shade
+from fieldpose.stages.nerf.kernels.types import Domain, Net, Rays, Samples
 
 
 class Gradients(NamedTuple):

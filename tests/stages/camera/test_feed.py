@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.camera.config import CameraConfig
-from stages.camera.core import CapturedFrame, Clock, Feed, Source
-from stages.camera.progress import Progress
-from stages.errors import ConfigError
-from stages.geometry import Camera
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.core import CapturedFrame, Clock, Feed, Source
+from fieldpose.stages.camera.progress import Progress
+from fieldpose.stages.errors import ConfigError
+from fieldpose.stages.geometry import Camera
 
 MS = 1_000_000
 START = 1_700_000_000_000 * MS

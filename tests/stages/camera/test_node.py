@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bus.messages import Frame, State, TrackingState
-from bus.node import EndOfInput, first_header
-from bus.topics import STATE
-from stages.camera.config import CameraConfig
-from stages.camera.node import CameraNode
-from stages.errors import SourceError
+from fieldpose.bus.messages import Frame, State, TrackingState
+from fieldpose.bus.node import EndOfInput, first_header
+from fieldpose.bus.topics import STATE
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.node import CameraNode
+from fieldpose.stages.errors import SourceError
 
 
 @pytest.fixture

@@ -13,15 +13,15 @@ import pytest
 from PIL import Image
 from support.posed_images import CAMERA, write_blender, write_transforms
 
-from bus.messages import CameraModel, Frame, Truth
-from bus.node import first_header
-from bus.recorder import RecordingWriter
-from bus.topics import FRAME, TRUTH, Address
-from stages.camera.config import CameraConfig
-from stages.camera.core import CapturedFrame
-from stages.camera.sources import KINDS, is_video, open_source
-from stages.errors import DatasetError, SourceError
-from stages.geometry import Camera, look_at
+from fieldpose.bus.messages import CameraModel, Frame, Truth
+from fieldpose.bus.node import first_header
+from fieldpose.bus.recorder import RecordingWriter
+from fieldpose.bus.topics import FRAME, TRUTH, Address
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.core import CapturedFrame
+from fieldpose.stages.camera.sources import KINDS, is_video, open_source
+from fieldpose.stages.errors import DatasetError, SourceError
+from fieldpose.stages.geometry import Camera, look_at
 
 MS = 1_000_000
 
@@ -287,9 +287,9 @@ def test_libraries_print_nothing_about_what_cannot_be_opened(tmp_path: Path) -> 
     broken_sources(tmp_path)
     program = """
 import sys
-from stages.camera.config import CameraConfig
-from stages.camera.sources import open_source
-from stages.errors import SourceError
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.sources import open_source
+from fieldpose.stages.errors import SourceError
 for source in sys.argv[1:]:
     try:
         open_source(CameraConfig(source))

@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.errors import StageError
-from stages.geometry import Camera, exp_se3, look_at, points_at_depth, rays
-from stages.geometry.cameras import distort
+from fieldpose.stages.errors import StageError
+from fieldpose.stages.geometry import Camera, exp_se3, look_at, points_at_depth, rays
+from fieldpose.stages.geometry.cameras import distort
 
 # The phone camera of instant-ngp's fox, and one with every coefficient at work.
 PHONE = Camera(

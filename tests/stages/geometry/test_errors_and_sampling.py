@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.geometry import (
+from fieldpose.stages.geometry import (
     camera_centre,
     inverse,
     is_rigid,
@@ -14,7 +14,7 @@ from stages.geometry import (
     translation_error,
     viewing_angles,
 )
-from stages.geometry.rigid import from_rotation
+from fieldpose.stages.geometry.rigid import from_rotation
 
 POSE = look_at((3.0, -2.0, 1.0), (0.2, 0.1, 0.0), (0, 0, 1))
 seeds = st.integers(0, 2**32 - 1)

@@ -4,8 +4,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from stages.errors import StageError
-from stages.geometry import rigid
+from fieldpose.stages.errors import StageError
+from fieldpose.stages.geometry import rigid
 
 number = st.floats(-3, 3, allow_subnormal=False)
 vector = st.tuples(number, number, number).map(np.array)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.geometry import twist_covariance
+from fieldpose.stages.geometry import twist_covariance
 
 
 def ones(count: int) -> np.ndarray:

@@ -4,9 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.analytic_scene import AnalyticScene, camera, distance_to_surface, viewpoint
 
-from stages.geometry import Camera, camera_centre, inverse, look_at, rays
-from stages.lifting.core import LiftingConfig, consistency, depth_at, lift
-from stages.nerf.rendering_api import RenderedRays, RenderedView
+from fieldpose.stages.geometry import Camera, camera_centre, inverse, look_at, rays
+from fieldpose.stages.lifting.core import LiftingConfig, consistency, depth_at, lift
+from fieldpose.stages.nerf.rendering_api import RenderedRays, RenderedView
 
 CAMERA = camera(120)
 POSE = viewpoint()

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
-from stages.lifting.core import ConsistencyMemory, LiftingConfig, lift
+from fieldpose.stages.lifting.core import ConsistencyMemory, LiftingConfig, lift
 
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.lists(st.integers(0, 30), max_size=12)), max_size=12))

@@ -8,8 +8,8 @@ import torch
 from kornia.feature import LoFTR
 from support.pictures import picture
 
-from stages.errors import WeightsError
-from stages.matching.core import Matcher, MatchingConfig, PairMatcher, build_matcher
+from fieldpose.stages.errors import WeightsError
+from fieldpose.stages.matching.core import Matcher, MatchingConfig, PairMatcher, build_matcher
 
 CELL = 8
 

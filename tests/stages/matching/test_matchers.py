@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from support.pictures import WarpedPair, needs, picture, warped
 
-from stages.errors import ConfigError
-from stages.matching.core import MATCHERS, Matcher, MatchingConfig, PairMatcher, build_matcher
+from fieldpose.stages.errors import ConfigError
+from fieldpose.stages.matching.core import MATCHERS, Matcher, MatchingConfig, PairMatcher, build_matcher
 
 SOLID = np.ones((256, 256), np.float32)
 FAMILIES = [

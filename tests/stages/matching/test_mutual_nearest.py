@@ -5,7 +5,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.matching.xfeat import mutual_nearest
+from fieldpose.stages.matching.xfeat import mutual_nearest
 
 
 @settings(max_examples=60, deadline=None)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from support.pictures import WarpedPair, needs, picture, warped
 
-from stages.matching.core import (
+from fieldpose.stages.matching.core import (
     Features,
     MatchedPixels,
     Matcher,
@@ -15,8 +15,8 @@ from stages.matching.core import (
     shrink,
     visible_mask,
 )
-from stages.matching.subpixel import align_patches
-from stages.matching.xfeat import XFeatExtractor
+from fieldpose.stages.matching.subpixel import align_patches
+from fieldpose.stages.matching.xfeat import XFeatExtractor
 
 SOLID = np.ones((256, 256), np.float32)
 

@@ -4,8 +4,8 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from stages.errors import WeightsError
-from stages.matching.weights import WeightsFile, find_weights, load_network, read_state
+from fieldpose.stages.errors import WeightsError
+from fieldpose.stages.matching.weights import WeightsFile, find_weights, load_network, read_state
 
 FILE = WeightsFile("net.pt", "carries-net", "carries_net/weights/net.pt", ("https://example.org/net.pt",))
 

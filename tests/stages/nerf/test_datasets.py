@@ -6,9 +6,9 @@ import pytest
 from PIL import Image
 from support import posed_images as made
 
-from stages.errors import DatasetError
-from stages.geometry import camera_centre, inverse, is_rigid, look_at, rotation_error_deg, translation_error
-from stages.nerf.datasets import Dataset, find_name, load_dataset
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.geometry import camera_centre, inverse, is_rigid, look_at, rotation_error_deg, translation_error
+from fieldpose.stages.nerf.datasets import Dataset, find_name, load_dataset
 
 SQUARE = made.centred(80, 80, 95.0)
 WIDE = made.centred(192, 128, 200.0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from support import posed_images as made
 
-from stages.errors import DatasetError
-from stages.nerf.datasets import load_dataset
+from fieldpose.stages.errors import DatasetError
+from fieldpose.stages.nerf.datasets import load_dataset
 
 SQUARE = made.centred(80, 80, 95.0)
 SCALED, FLIPPED, SHEARED = np.diag([2.0, 2, 2, 1]), np.diag([1.0, 1, -1, 1]), np.eye(4) + 0.02 * np.eye(4, k=1)

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stages.geometry import rays, translation_error
-from stages.nerf.datasets import load_dataset
+from fieldpose.stages.geometry import rays, translation_error
+from fieldpose.stages.nerf.datasets import load_dataset
 
 DEMO = Path(__file__).parents[3] / "recordings" / "demo"
 pytestmark = pytest.mark.skipif(

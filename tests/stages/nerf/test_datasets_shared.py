@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from stages.geometry import inverse, translation_error
-from stages.nerf.datasets import Dataset, ImageRecord, load_dataset
+from fieldpose.stages.geometry import inverse, translation_error
+from fieldpose.stages.nerf.datasets import Dataset, ImageRecord, load_dataset
 
 DATA = Path(__file__).parents[3].parent / "shared" / "data"
 

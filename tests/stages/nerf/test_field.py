@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load_file, save_file
 
-from stages.errors import FieldFileError
-from stages.geometry import Camera, look_at
-from stages.nerf.config import FieldConfig
-from stages.nerf.field import Field, grid_layout, load_field, new_net
-from stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
-from stages.nerf.occupancy import from_cube, seen_by_cameras
-from stages.nerf.twin import TwinField
+from fieldpose.stages.errors import FieldFileError
+from fieldpose.stages.geometry import Camera, look_at
+from fieldpose.stages.nerf.config import FieldConfig
+from fieldpose.stages.nerf.field import Field, grid_layout, load_field, new_net
+from fieldpose.stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
+from fieldpose.stages.nerf.occupancy import from_cube, seen_by_cameras
+from fieldpose.stages.nerf.twin import TwinField
 
 CONFIG = FieldConfig(levels=3, log2_table=8, hidden=8, features=4, colour_hidden=8, occupancy_resolution=16)
 

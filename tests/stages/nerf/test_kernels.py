@@ -8,15 +8,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.geometry import Camera, look_at
-from stages.nerf.config import FieldConfig
-from stages.nerf.field import Field, domain_of, new_net
-from stages.nerf.kernels.train import Gradients, train
-from stages.nerf.metadata import FieldMetadata, Space
-from stages.nerf.renderer import STOP_BELOW, NumbaRenderer
-from stages.nerf.torch_renderer import TorchRenderer
-from stages.nerf.twin import distortion_loss, twin_of
-from stages.nerf.workers import Workers
+from fieldpose.stages.geometry import Camera, look_at
+from fieldpose.stages.nerf.config import FieldConfig
+from fieldpose.stages.nerf.field import Field, domain_of, new_net
+from fieldpose.stages.nerf.kernels.train import Gradients, train
+from fieldpose.stages.nerf.metadata import FieldMetadata, Space
+from fieldpose.stages.nerf.renderer import STOP_BELOW, NumbaRenderer
+from fieldpose.stages.nerf.torch_renderer import TorchRenderer
+from fieldpose.stages.nerf.twin import distortion_loss, twin_of
+from fieldpose.stages.nerf.workers import Workers
 
 BOX = Space(False, (0.1, -0.2, 0.3), 1.5, half=(1.0, 0.8, 0.9), step=0.03)
 BALL = Space(True, (0.1, -0.2, 0.3), 1.5, near=0.05, far=20.0, step=0.06)

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.nerf.occupancy import finer
+from fieldpose.stages.nerf.occupancy import finer
 
 
 def fog(seed: int):  # type: ignore[no-untyped-def]

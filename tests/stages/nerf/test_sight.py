@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stages.geometry import Camera, exp_se3, look_at, rays
-from stages.nerf.config import FieldConfig
-from stages.nerf.field import Field, new_net
-from stages.nerf.kernels.sight import block_centres, block_radius, tile_limits
-from stages.nerf.metadata import FieldMetadata, Space
-from stages.nerf.renderer import NumbaRenderer
+from fieldpose.stages.geometry import Camera, exp_se3, look_at, rays
+from fieldpose.stages.nerf.config import FieldConfig
+from fieldpose.stages.nerf.field import Field, new_net
+from fieldpose.stages.nerf.kernels.sight import block_centres, block_radius, tile_limits
+from fieldpose.stages.nerf.metadata import FieldMetadata, Space
+from fieldpose.stages.nerf.renderer import NumbaRenderer
 
 BOX = Space(False, (0.1, -0.2, 0.3), 1.5, half=(1.0, 0.8, 0.9), step=0.03)
 CONFIG = FieldConfig(

@@ -11,18 +11,18 @@ import torch
 from support import posed_images
 from support.analytic_scene import AnalyticScene
 
-from stages.errors import ConfigError, DatasetError
-from stages.geometry import Camera, look_at, rays
-from stages.nerf import from_dataset
-from stages.nerf.config import FieldConfig, TrainingConfig
-from stages.nerf.field import load_field
-from stages.nerf.loading import load_renderer
-from stages.nerf.metadata import FieldMetadata, Space
-from stages.nerf.raybank import View
-from stages.nerf.renderer import NumbaRenderer
-from stages.nerf.torch_renderer import torch_device
-from stages.nerf.torch_training import TorchTrainer
-from stages.nerf.training import Trainer, evaluate
+from fieldpose.stages.errors import ConfigError, DatasetError
+from fieldpose.stages.geometry import Camera, look_at, rays
+from fieldpose.stages.nerf import from_dataset
+from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
+from fieldpose.stages.nerf.field import load_field
+from fieldpose.stages.nerf.loading import load_renderer
+from fieldpose.stages.nerf.metadata import FieldMetadata, Space
+from fieldpose.stages.nerf.raybank import View
+from fieldpose.stages.nerf.renderer import NumbaRenderer
+from fieldpose.stages.nerf.torch_renderer import torch_device
+from fieldpose.stages.nerf.torch_training import TorchTrainer
+from fieldpose.stages.nerf.training import Trainer, evaluate
 
 SMALL = FieldConfig(
     levels=4, log2_table=14, finest_resolution=96, hidden=32, features=7, colour_hidden=16, occupancy_resolution=32

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from stages.nerf.config import FieldConfig
-from stages.nerf.field import new_net
-from stages.nerf.kernels.encoding import encode, position_gradients, scatter
-from stages.nerf.kernels.packet import density, exponential
-from stages.nerf.kernels.vectors import reads_half_floats
-from stages.nerf.workers import new_samples
+from fieldpose.stages.nerf.config import FieldConfig
+from fieldpose.stages.nerf.field import new_net
+from fieldpose.stages.nerf.kernels.encoding import encode, position_gradients, scatter
+from fieldpose.stages.nerf.kernels.packet import density, exponential
+from fieldpose.stages.nerf.kernels.vectors import reads_half_floats
+from fieldpose.stages.nerf.workers import new_samples
 
 
 @njit

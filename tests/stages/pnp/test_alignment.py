@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
-from stages.errors import StageError
-from stages.geometry import Camera, exp_se3, perturb, rays, rotation_error_deg, translation_error
-from stages.nerf.rendering_api import RenderedView
-from stages.pnp.alignment import Aligner, Pictures, Placed, inverse_depth_slopes
-from stages.pnp.core import PnpConfig, PnpResult, solve
+from fieldpose.stages.errors import StageError
+from fieldpose.stages.geometry import Camera, exp_se3, perturb, rays, rotation_error_deg, translation_error
+from fieldpose.stages.nerf.rendering_api import RenderedView
+from fieldpose.stages.pnp.alignment import Aligner, Pictures, Placed, inverse_depth_slopes
+from fieldpose.stages.pnp.core import PnpConfig, PnpResult, solve
 
 TRUTH = viewpoint(25.0, 38.0)
 LENS = camera(260, (-0.1, 0.02, 0.001, -0.001, 0.0))

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
-from stages.geometry import rays
-from stages.nerf.rendering_api import RenderedView
-from stages.pnp.alignment import Pictures
-from stages.pnp.landmarks import landmarks
+from fieldpose.stages.geometry import rays
+from fieldpose.stages.nerf.rendering_api import RenderedView
+from fieldpose.stages.pnp.alignment import Pictures
+from fieldpose.stages.pnp.landmarks import landmarks
 
 VIEW = camera(200)
 POSE = viewpoint(25.0, 38.0)

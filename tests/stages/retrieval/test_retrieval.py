@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.pictures import needs
 
-from deploy.scene import demo_file
-from stages.errors import ConfigError
-from stages.geometry import camera_centre
-from stages.matching.core import MatchingConfig
-from stages.nerf.datasets import load_dataset
-from stages.nerf.field import load_field
-from stages.retrieval.core import RetrievalConfig, Retriever, describer, remembered
+from fieldpose.deploy.scene import demo_file
+from fieldpose.stages.errors import ConfigError
+from fieldpose.stages.geometry import camera_centre
+from fieldpose.stages.matching.core import MatchingConfig
+from fieldpose.stages.nerf.datasets import load_dataset
+from fieldpose.stages.nerf.field import load_field
+from fieldpose.stages.retrieval.core import RetrievalConfig, Retriever, describer, remembered
 
 
 def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:

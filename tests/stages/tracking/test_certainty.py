@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.tracking_world import ring_of_views
 
-from bus.messages import GuessReason
-from stages.geometry import exp_se3
-from stages.tracking.certainty import Certainty
-from stages.tracking.config import TrackingConfig
-from stages.tracking.frame_policies import EachFramePolicy
-from stages.tracking.policy import Attempt, FrameInfo, Policy, PoseGuess, PoseResult
-from stages.tracking.track_policy import TrackPolicy
+from fieldpose.bus.messages import GuessReason
+from fieldpose.stages.geometry import exp_se3
+from fieldpose.stages.tracking.certainty import Certainty
+from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.frame_policies import EachFramePolicy
+from fieldpose.stages.tracking.policy import Attempt, FrameInfo, Policy, PoseGuess, PoseResult
+from fieldpose.stages.tracking.track_policy import TrackPolicy
 
 COVARIANCE = np.diag([1e-4] * 3 + [1e-5] * 3)
 SCALE = 2.0

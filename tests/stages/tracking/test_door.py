@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bus.messages import GuessReason, TrackingState
-from stages.errors import ConfigError
-from stages.tracking.config import MotionConfig, TrackingConfig
-from stages.tracking.core import GuessOrder, Output, StateReport, Tracker
-from stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
+from fieldpose.bus.messages import GuessReason, TrackingState
+from fieldpose.stages.errors import ConfigError
+from fieldpose.stages.tracking.config import MotionConfig, TrackingConfig
+from fieldpose.stages.tracking.core import GuessOrder, Output, StateReport, Tracker
+from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
 
 MS = 1_000_000
 

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from support.tracking_world import on_sphere, ring_of_views
 
-from bus.messages import GuessReason, TrackingState
-from stages.errors import ConfigError, DatasetError
-from stages.geometry import rotation_error_deg, translation_error
-from stages.tracking.config import TrackingConfig
-from stages.tracking.distance import Limit, pairwise
-from stages.tracking.frame_policies import EachFramePolicy, PerturbedTruthPolicy
-from stages.tracking.guesses import make_policy, needs_truth, start_pose
-from stages.tracking.policy import Attempt, FrameInfo, PoseResult
-from stages.tracking.retrieved import RetrievedPoses
-from stages.tracking.track_policy import TrackPolicy
-from stages.tracking.views import Keyframes, Relocaliser, TrainingViews, farthest_point_order, nearest_first
+from fieldpose.bus.messages import GuessReason, TrackingState
+from fieldpose.stages.errors import ConfigError, DatasetError
+from fieldpose.stages.geometry import rotation_error_deg, translation_error
+from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.distance import Limit, pairwise
+from fieldpose.stages.tracking.frame_policies import EachFramePolicy, PerturbedTruthPolicy
+from fieldpose.stages.tracking.guesses import make_policy, needs_truth, start_pose
+from fieldpose.stages.tracking.policy import Attempt, FrameInfo, PoseResult
+from fieldpose.stages.tracking.retrieved import RetrievedPoses
+from fieldpose.stages.tracking.track_policy import TrackPolicy
+from fieldpose.stages.tracking.views import Keyframes, Relocaliser, TrainingViews, farthest_point_order, nearest_first
 
 VIEWS = ring_of_views()
 FRAME = FrameInfo(7, 0)

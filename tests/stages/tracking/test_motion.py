@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stages.geometry import exp_se3, inverse, log_se3
-from stages.tracking.config import MotionConfig
-from stages.tracking.motion import MotionModel
+from fieldpose.stages.geometry import exp_se3, inverse, log_se3
+from fieldpose.stages.tracking.config import MotionConfig
+from fieldpose.stages.tracking.motion import MotionModel
 
 SECOND = 1_000_000_000
 UNDAMPED = MotionConfig(damping_ms=float("inf"), max_rotation_deg=180, max_translation=100, horizon_ms=1e6)

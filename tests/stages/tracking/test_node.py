@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 from support.posed_images import CAMERA, write_blender
 
-from bus.memory import MemoryBus
-from bus.messages import (
+from fieldpose.bus.memory import MemoryBus
+from fieldpose.bus.messages import (
     CameraModel,
     Frame,
     Guess,
@@ -28,19 +28,19 @@ from bus.messages import (
     TrackingState,
     Truth,
 )
-from bus.node import Handler, Output, first_header, reply_header, run_node
-from bus.ports import Inbox
-from bus.topics import FRAME, GUESS, POSE, RETRIEVED, STATE, TRUTH, Address, Topic
-from stages.camera.config import CameraConfig
-from stages.camera.node import CameraNode
-from stages.errors import ConfigError, FieldFileError
-from stages.geometry import rotation_error_deg
-from stages.nerf.config import FieldConfig
-from stages.nerf.field import Field, new_net
-from stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
-from stages.tracking.config import TrackingConfig
-from stages.tracking.node import TrackingNode
-from stages.tracking.wire import pose_result
+from fieldpose.bus.node import Handler, Output, first_header, reply_header, run_node
+from fieldpose.bus.ports import Inbox
+from fieldpose.bus.topics import FRAME, GUESS, POSE, RETRIEVED, STATE, TRUTH, Address, Topic
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.node import CameraNode
+from fieldpose.stages.errors import ConfigError, FieldFileError
+from fieldpose.stages.geometry import rotation_error_deg
+from fieldpose.stages.nerf.config import FieldConfig
+from fieldpose.stages.nerf.field import Field, new_net
+from fieldpose.stages.nerf.metadata import FieldMetadata, Space, TrainingCamera
+from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.node import TrackingNode
+from fieldpose.stages.tracking.wire import pose_result
 
 TINY = FieldConfig(levels=2, log2_table=8, hidden=8, occupancy_resolution=8)
 

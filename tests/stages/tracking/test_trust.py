@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bus.messages import TrackingState
-from stages.tracking.config import ScoreConfig
-from stages.tracking.policy import PoseResult
-from stages.tracking.scoring import deviations, score
-from stages.tracking.trust import Trust
+from fieldpose.bus.messages import TrackingState
+from fieldpose.stages.tracking.config import ScoreConfig
+from fieldpose.stages.tracking.policy import PoseResult
+from fieldpose.stages.tracking.scoring import deviations, score
+from fieldpose.stages.tracking.trust import Trust
 
 GOOD = PoseResult(0, 0, True, np.eye(4), np.diag([1e-6] * 6), inliers=100, correspondences=120, residual_px=0.8)
 

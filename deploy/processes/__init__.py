@@ -1,0 +1,1 @@
+"""Running the graph as processes over Zenoh: started, watched, ended, and listened to."""

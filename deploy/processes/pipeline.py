@@ -1,0 +1,230 @@
+"""A whole pipeline on this machine: its processes started, watched and ended, its results gathered."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from fieldpose.bus.errors import RecordingError
+from fieldpose.bus.messages import State
+from fieldpose.bus.recording import partial_path
+from fieldpose.bus.replay import RecordingInfo, info
+from fieldpose.bus.signals import StopSignals
+from fieldpose.bus.transport import ZenohBus
+from fieldpose.deploy.errors import ProcessError
+from fieldpose.deploy.graph import CAMERA, HUB, OBSERVER, RECORDER, STAGES, TABLE, thread_environment, threads_of
+from fieldpose.deploy.processes.collector import Collector
+from fieldpose.deploy.processes.endpoints import check_free, free_port, peer_address
+from fieldpose.deploy.processes.supervision import Program, Supervisor
+from fieldpose.deploy.reporting.results import RunResult
+from fieldpose.deploy.settings import Settings, to_json
+
+_START_S = 300.0
+_RESTARTS_AT_START, _RESTARTS = 2, 10
+_POLL_S = 0.1
+_SETTLE_S = 0.2
+_STAGES_STOP_S, _RECORDER_STOP_S, _HUB_STOP_S = 2.0, 2.0, 0.5
+"""Together under the 5 s after a Ctrl-C."""
+_RECORDER_FINISHES_S = 60.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run. `listen`: the hub's address (default: a free port of this machine); `logs`: a folder to keep."""
+
+    field: Path
+    settings: Settings
+    record: Path | None = None
+    listen: str | None = None
+    logs: Path | None = None
+
+    @property
+    def processes(self) -> list[str]:
+        """The processes of this run, the hub among them."""
+        return [name for name in TABLE if name != RECORDER or self.record is not None]
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a run is doing, for people to look at."""
+
+    phase: Literal["starting", "running", "finishing"]
+    waiting_for: tuple[str, ...] = ()
+    sent: int = 0
+    rate_hz: float = 0.0
+    state: State | None = None
+    restarts: int = 0
+
+
+Report = Callable[[Progress], None]
+
+
+def run_pipeline(plan: Plan, report: Report = lambda progress: None) -> RunResult:
+    """Run the source to its end, or until Ctrl-C or SIGTERM, and end every process.
+
+    Raises ProcessError where a process cannot start or does not stay up, TransportError for a bad or used address,
+    RecordingError for a recording that is in the way or could not be finished.
+    """
+    _check_recording(plan.record)
+    check_free(plan.listen)
+    with StopSignals() as signals, _folder(plan.logs) as folder:
+        hub = plan.listen or f"tcp/127.0.0.1:{free_port()}"
+        with Supervisor(folder, programs(plan, folder, hub)) as supervisor:
+            return _Run(plan, supervisor, hub, signals, report).run()
+
+
+def programs(plan: Plan, folder: Path, hub: str) -> list[Program]:
+    """The command line and environment of each process; their settings are left in `folder`."""
+    progress_file = folder / "camera-progress.json"
+    progress_file.unlink(missing_ok=True)
+    camera = replace(plan.settings.camera, progress_file=progress_file)
+    config = folder / "settings.json"
+    config.write_bytes(to_json(replace(plan.settings, camera=camera)))
+    listeners = (OBSERVER, RECORDER) if plan.record is not None else (OBSERVER,)
+    everyone = (*listeners, *(name for name in STAGES if name != CAMERA))
+    programs = []
+    for name in plan.processes:
+        spec = TABLE[name]
+        threads = threads_of(spec, plan.settings.tracking.depth)
+        command = [sys.executable, "-P", "-m", "fieldpose", "stage", name, "--connect", hub, "--config", str(config)]
+        command += ["--field", str(plan.field.resolve()), "--threads", str(threads)]
+        if name == RECORDER and plan.record is not None:
+            command += ["--record", str(plan.record.resolve()), "--wait-for", OBSERVER]
+        elif name != HUB:
+            command += ["--wait-for", *(everyone if name == CAMERA else listeners)]
+        programs.append(Program(name, command, thread_environment(threads), spec.stop_s, ends=name == CAMERA))
+    return programs
+
+
+class _Run:
+    def __init__(self, plan: Plan, supervisor: Supervisor, hub: str, signals: StopSignals, report: Report) -> None:
+        self._plan = plan
+        self._supervisor = supervisor
+        self._hub = hub
+        self._stop = signals.stop
+        self._report = report
+        self._limit = _RESTARTS_AT_START
+
+    def run(self) -> RunResult:
+        began = time.monotonic()
+        bus = ZenohBus(self._hub, peer_address(self._hub))
+        try:
+            collector = Collector(bus, self._plan.settings.address)
+            token = bus.hold(self._plan.settings.address.live(OBSERVER))
+            start_s = self._start(bus, collector) - began
+            finished = self._watch(collector)
+            self._finish(collector, finished)
+            token.close()
+            collector.close()
+        finally:
+            bus.close()
+        return RunResult(
+            frames=collector.results(),
+            sent=collector.sent,
+            stats=collector.stats,
+            observed=collector.observed,
+            restarts=dict(self._supervisor.restarts),
+            recording=_recording(self._plan.record, self._supervisor),
+            interrupted=not finished,
+            start_s=start_s,
+        )
+
+    def _start(self, bus: ZenohBus, collector: Collector) -> float:
+        """Return when all processes are ready, or are to be stopped; returns when that was."""
+        address = self._plan.settings.address
+        wanted = {address.live(name): name for name in self._plan.processes if name != HUB}
+        alive: set[str] = set()
+        watching = bus.watch(address.live("*"), lambda key, up: (alive.add if up else alive.discard)(key))
+        deadline = time.monotonic() + _START_S
+        while not self._stop.is_set():
+            waiting = tuple(name for key, name in wanted.items() if key not in alive)
+            camera_finished = self._look(collector)
+            if not waiting or camera_finished or collector.sent:
+                break
+            if time.monotonic() > deadline:
+                raise ProcessError(f"not ready after {_START_S:g} s: {', '.join(waiting)}")
+            self._report(Progress("starting", waiting))
+            self._stop.wait(_POLL_S)
+        watching.close()
+        self._limit = _RESTARTS
+        return time.monotonic()
+
+    def _watch(self, collector: Collector) -> bool:
+        """Look after the processes until the camera has finished; False where it was stopped before."""
+        while not self._stop.is_set():
+            if self._look(collector):
+                return True
+            self._report(self._progress(collector, "running"))
+            self._stop.wait(_POLL_S)
+        return False
+
+    def _look(self, collector: Collector) -> bool:
+        """Take in what has come and check on the processes; returns whether the camera has finished."""
+        collector.update()
+        camera = self._supervisor.check(self._limit).get(CAMERA)
+        return camera is not None and camera.finished
+
+    def _finish(self, collector: Collector, finished: bool) -> None:
+        """End the stages, then the recorder, so that it has all that they said, then the hub."""
+        self._report(self._progress(collector, "finishing"))
+        time.sleep(_SETTLE_S)
+        self._supervisor.stop(STAGES, _STAGES_STOP_S)
+        time.sleep(_SETTLE_S)
+        collector.update()
+        self._supervisor.stop([RECORDER], _RECORDER_FINISHES_S if finished else _RECORDER_STOP_S)
+        self._supervisor.stop([HUB], _HUB_STOP_S)
+
+    def _progress(self, collector: Collector, phase: Literal["running", "finishing"]) -> Progress:
+        return Progress(
+            phase,
+            sent=collector.sent,
+            rate_hz=collector.rate_hz(time.time_ns()),
+            state=collector.newest_state,
+            restarts=sum(self._supervisor.restarts.values()),
+        )
+
+
+def _check_recording(path: Path | None) -> None:
+    """Raise RecordingError for a recording that cannot be begun."""
+    if path is None:
+        return
+    if partial_path(path).exists():
+        raise RecordingError(
+            f"{partial_path(path)}: an unfinished recording is in the way; `fieldpose recover {path}` saves what is"
+            " in it, or remove it"
+        )
+
+
+def _recording(path: Path | None, supervisor: Supervisor) -> RecordingInfo | None:
+    if path is None:
+        return None
+    if partial_path(path).exists() or not path.exists():
+        raise RecordingError(f"{path}: the recording was not finished: {supervisor.last_line(RECORDER)}")
+    return info(path)
+
+
+@contextmanager
+def _folder(kept: Path | None) -> Iterator[Path]:
+    """A folder for what the processes need and say; one that was not asked for is kept only if they fail."""
+    if kept is not None:
+        kept.mkdir(parents=True, exist_ok=True)
+        yield kept
+        return
+    folder = Path(tempfile.mkdtemp(prefix="fieldpose-"))
+    try:
+        yield folder
+    except ProcessError as error:
+        if str(folder) not in str(error):
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,39 @@
+"""Compiling the field's kernels once for all processes, before any of them is ready."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from fieldpose.bus.logs import stage_logger
+
+_WORTH_TELLING_S = 3.0
+
+
+def compile_kernels(field: Path, process: str) -> None:
+    """Have the rendering kernels compiled, or fetched from the cache that processes share.
+
+    Processes take turns, so that the first compiles and the others find the result. Raises FieldFileError.
+    """
+    from fieldpose.stages.nerf.loading import load_renderer, warm_up
+
+    with one_at_a_time():
+        began = time.monotonic()
+        warm_up(load_renderer(field))
+        seconds = time.monotonic() - began
+    if seconds > _WORTH_TELLING_S:
+        stage_logger(process).info("compiled the kernels, for this and the next start", seconds=round(seconds, 1))
+
+
+@contextmanager
+def one_at_a_time() -> Iterator[None]:
+    """Hold this user's lock on compiling; the kernel lets go of it if the process dies."""
+    path = Path(tempfile.gettempdir()) / f"fieldpose-compiling-{os.getuid()}.lock"
+    with path.open("w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield

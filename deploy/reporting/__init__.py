@@ -1,0 +1,1 @@
+"""What a run has achieved, for people and for programs."""

@@ -1,0 +1,60 @@
+"""What commands give out: files that are whole or not there, and text for people."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from rich.console import Console
+
+from fieldpose.deploy.errors import OutputError
+
+_FILE_WIDTH = 140
+
+
+def progress_console() -> Console:
+    """Where progress goes: stderr, so that what a command prints can be read by other programs."""
+    return Console(stderr=True)
+
+
+def result_console() -> Console:
+    """Where results go: stdout, with room for tables where that is no terminal."""
+    console = Console()
+    return console if console.is_terminal else Console(width=_FILE_WIDTH)
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file under a temporary name, then give it its own. Raises OutputError."""
+    partial = path.with_name(path.name + ".partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(content)
+        os.replace(partial, path)
+    except OSError as error:
+        with suppress(OSError):
+            partial.unlink()
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def write_json(path: Path | None, value: Any) -> None:
+    """Write anything that msgspec can encode as indented JSON; nothing where `path` is None. Raises OutputError."""
+    if path is not None:
+        write_bytes(path, msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n")
+
+
+def check_writable(*paths: Path | None) -> None:
+    """Raise OutputError where a file could not be written later, before long work is begun."""
+    for path in paths:
+        if path is None:
+            continue
+        if path.is_dir():
+            raise OutputError(f"{path}: is a folder; give the name of a file")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{path}: its folder cannot be made: {error.strerror}") from error
+        if not os.access(path.parent, os.W_OK):
+            raise OutputError(f"{path}: no right to write in {path.parent}")

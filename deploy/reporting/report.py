@@ -1,0 +1,108 @@
+"""How a run is shown to people: a line that lives while it lasts, and a table at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from rich.table import Table
+
+from fieldpose.deploy.processes.pipeline import Progress
+from fieldpose.deploy.reporting.output import progress_console, result_console
+
+_MISSING = "-"
+
+
+@contextmanager
+def live_line(title: str) -> Iterator[Callable[[Progress], None]]:
+    """Gives a function that shows a run's progress on stderr."""
+    console = progress_console()
+    phase = ""
+    with console.status(title) as status:
+
+        def report(progress: Progress) -> None:
+            nonlocal phase
+            if progress.phase != phase and not console.is_terminal:
+                console.print(f"{title}: {progress.phase}", highlight=False)
+            phase = progress.phase
+            status.update(f"{title}: {_in_words(progress)}")
+
+        yield report
+
+
+def _in_words(progress: Progress) -> str:
+    if progress.phase == "starting":
+        return f"starting, waiting for {', '.join(progress.waiting_for) or 'the camera'}"
+    if progress.phase == "finishing":
+        return "finishing"
+    words = [f"{progress.sent} frames sent", f"{progress.rate_hz:.1f} poses/s"]
+    if progress.state is not None:
+        state = progress.state
+        words += [
+            str(state.state),
+            f"{state.in_flight} in flight",
+            f"{state.dropped_at_the_door} dropped at the door",
+        ]
+    if progress.restarts:
+        words.append(f"{progress.restarts} restarts")
+    return ", ".join(words)
+
+
+def print_summary(summary: Mapping[str, Any], title: str) -> None:
+    """Print the tables of a run's summary on stdout."""
+    console = result_console()
+    console.print(_figures(summary, title))
+    console.print(_stages(summary))
+
+
+def _figures(summary: Mapping[str, Any], title: str) -> Table:
+    table = Table(title=title, show_header=False, title_justify="left")
+    table.add_column("what")
+    table.add_column("value", justify="right")
+    for what, value in _rows(summary):
+        table.add_row(what, value)
+    return table
+
+
+def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    sent, dropped = summary["frames_sent"], summary["dropped_at_the_door"]
+    yield "frames sent / dropped at the door", f"{sent} / {dropped}"
+    yield "frames / with a pose / lost", f"{summary['frames']} / {summary['poses_ok']} / {summary['frames_lost']}"
+    for key, what, unit in (
+        ("rotation_error_deg", "rotation error: median, mean, p90", "deg"),
+        ("translation_error", "translation error: median, mean, p90", "units"),
+    ):
+        if summary[key] is not None:
+            values = (summary[key][name] for name in ("median", "mean", "p90"))
+            yield what, f"{', '.join(f'{value:.3g}' for value in values)} {unit}"
+    for key, what in (
+        ("share_re_below_5deg", "frames with an error below 5 deg"),
+        ("share_te_below_0.05", "frames with an error below 0.05 units"),
+    ):
+        if summary[key] is not None:
+            yield what, f"{summary[key]:.1%} of {summary['frames_with_truth']}"
+    if summary["out_of_view"]["frames"]:
+        yield "object out of view / poses claimed there", "{frames} / {poses_ok}".format(**summary["out_of_view"])
+    yield "frames a second", f"{summary['rate_hz']:.1f}"
+    latency = summary["latency_ms"]
+    yield "latency: p50, p90, p99", f"{', '.join(_number(latency[name]) for name in ('p50', 'p90', 'p99'))} ms"
+    messages = summary["messages"]
+    yield "messages recorded / lost", f"{messages['recorded']} / {messages['lost']}"
+    restarts = ", ".join(f"{name} {count}x" for name, count in summary["restarts"].items())
+    yield "processes restarted", restarts or "none"
+
+
+def _stages(summary: Mapping[str, Any]) -> Table:
+    table = Table(title="latency by stage, waiting included (ms)", title_justify="left")
+    for heading in ("stage", "p50", "p90", "its own work, p50", "cpu s", "memory MB"):
+        table.add_column(heading, justify="left" if heading == "stage" else "right")
+    for name, latency in summary["latency_ms"]["by_stage"].items():
+        process = summary["processes"].get(name, {})
+        numbers = (*latency.values(), process.get("busy_ms_p50"), process.get("cpu_s"), process.get("rss_mb"))
+        table.add_row(name, *(_number(value) for value in numbers))
+    return table
+
+
+def _number(value: float | None) -> str:
+    return _MISSING if value is None else f"{value:.1f}"

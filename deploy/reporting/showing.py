@@ -1,0 +1,111 @@
+"""A picture and a video of a recorded run: the field rendered at each pose found, over the camera's images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import cv2
+import msgspec
+import numpy as np
+
+from fieldpose.bus.messages import Frame
+from fieldpose.bus.replay import read_recording
+from fieldpose.bus.topics import FRAME
+from fieldpose.deploy.errors import OutputError
+from fieldpose.deploy.reporting.overlay import VideoFile, captioned, overlaid, without_distortion
+from fieldpose.deploy.reporting.results import FrameResult
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.nerf.rendering_api import RayRenderer
+
+_VIDEO_HZ = 30.0
+_WIDEST = 480
+_LONGEST_STILL_S = 1.0
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Two images (h, 2 w, 3) uint8 RGB side by side: the camera's, and the same with the field over it."""
+
+    pixels: np.ndarray
+    result: FrameResult
+
+
+def pictures(
+    recording: Path,
+    results: Sequence[FrameResult],
+    renderer: RayRenderer,
+    report: Callable[[int, int], None] = lambda done, total: None,
+) -> Iterator[Picture]:
+    """The recorded frames that were worked on, in order; those without a pose show the camera's image alone.
+
+    Raises RecordingError, and OutputError for a frame that cannot be decoded.
+    """
+    finished = {result.frame_id: result for result in results if result.outcome == "finished"}
+    done = 0
+    for recorded in read_recording(recording, (FRAME,)):
+        frame = cast(Frame, recorded.message)
+        result = finished.pop(frame.header.frame_id, None)
+        if result is not None:
+            yield _picture(frame, result, renderer)
+            done += 1
+            report(done, len(finished) + done)
+
+
+def write_video(path: Path, shown: Iterator[Picture]) -> Picture | None:
+    """Write pictures at the pace that their frames were taken; returns the one with the best pose, if any.
+
+    A frame stays on screen until the next one that was worked on.
+    """
+    video: VideoFile | None = None
+    best: Picture | None = None
+    before: Picture | None = None
+    for picture in shown:
+        if video is None:
+            video = VideoFile(path, _VIDEO_HZ, picture.pixels.shape[1], picture.pixels.shape[0])
+        if before is not None:
+            video.add(before.pixels, _repeats(before, picture))
+        before = picture
+        if best is None or picture.result.score > best.result.score:
+            best = picture
+    if video is not None and before is not None:
+        video.add(before.pixels, 1)
+        video.close()
+    return best
+
+
+def _repeats(picture: Picture, following: Picture) -> int:
+    seconds = (following.result.capture_ns - picture.result.capture_ns) / 1e9
+    return max(1, round(min(seconds, _LONGEST_STILL_S) * _VIDEO_HZ))
+
+
+def _picture(frame: Frame, result: FrameResult, renderer: RayRenderer) -> Picture:
+    camera = Camera(**msgspec.structs.asdict(frame.camera))
+    image = without_distortion(_decoded(frame), camera)
+    factor = min(1.0, _WIDEST / max(camera.width, camera.height))
+    small = camera.undistorted().scaled(factor)
+    image = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    over = image
+    if result.cam_from_object is not None:
+        over = overlaid(image, renderer.render_view(small, result.cam_from_object))
+    both = np.concatenate([captioned(image, ["camera"]), captioned(over, _caption(result))], axis=1)
+    # Video files want even sizes.
+    return Picture(both[: both.shape[0] // 2 * 2, : both.shape[1] // 2 * 2], result)
+
+
+def _caption(result: FrameResult) -> list[str]:
+    lines = [f"{result.state}" if result.cam_from_object is not None else f"{result.state}: no pose"]
+    if result.errors is not None:
+        lines.append(f"error {result.errors[0]:.2f} deg, {result.errors[1]:.4f} units")
+    return lines
+
+
+def _decoded(frame: Frame) -> np.ndarray:
+    if frame.encoding == "rgb8":
+        return frame.image
+    bgr = cv2.imdecode(frame.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if bgr is None:
+        raise OutputError(f"frame {frame.header.frame_id} of the recording cannot be decoded")
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)

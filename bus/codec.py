@@ -13,8 +13,8 @@ import msgpack
 import msgspec
 import numpy as np
 
-from fieldpose.bus.errors import CodecError
 from fieldpose.bus.messages import Header, Message
+from fieldpose.errors import CodecError
 
 M = TypeVar("M", bound=Message)
 

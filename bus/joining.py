@@ -5,19 +5,39 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, TypeVar
 
 from fieldpose.bus.messages import Header, Message
-from fieldpose.bus.topics import FRAME, JOIN_CAPACITY, Topic
+from fieldpose.bus.ports import reply_header
+from fieldpose.bus.topics import JOIN_CAPACITY, Topic
+
+M = TypeVar("M", bound=Message)
 
 Key = tuple[int, int, int]
 
 
-class Joined(NamedTuple):
-    """The inputs of one frame and pass; `missing` names those that did not come in time."""
+class Joined:
+    """The inputs of one frame and pass, by topic; `missing` names those that did not come in time."""
 
-    inputs: dict[Topic, Message]
-    missing: tuple[Topic, ...]
+    def __init__(self, header: Header, inputs: dict[Topic[Any], Message], missing: tuple[Topic[Any], ...] = ()) -> None:
+        self.header = reply_header(header)
+        self.missing = missing
+        self._inputs = inputs
+
+    def __getitem__(self, topic: Topic[M]) -> M:
+        message = self.get(topic)
+        if message is None:
+            raise KeyError(topic.name)
+        return message
+
+    def get(self, topic: Topic[M]) -> M | None:
+        """The message of a topic; None where it is missing."""
+        return self._inputs.get(topic)  # type: ignore[return-value]
+
+    @property
+    def frame_key(self) -> tuple[int, int]:
+        """Tells the frame from all others of its camera."""
+        return self.header.frame_id, self.header.capture_ns
 
 
 @dataclass
@@ -29,19 +49,20 @@ class _Waiting:
 class Joiner:
     """The first input drives: each of its messages comes out once, joined or, after `timeout_s`, incomplete.
 
-    The other inputs wait for it in rings. Frames are joined by their id alone and stay in their ring, for later
-    passes. The capture time belongs to the key, so that frames of a camera that started again are not mixed up.
+    The other inputs wait for it in rings. What there is one of a frame is joined by its id alone and stays in its
+    ring, for later passes. The capture time belongs to the key, so that frames of a camera that started again are not
+    mixed up.
     """
 
-    def __init__(self, inputs: tuple[Topic, ...], timeout_s: float = 1.0) -> None:
+    def __init__(self, inputs: tuple[Topic[Any], ...], timeout_s: float = 1.0) -> None:
         self._primary = inputs[0]
-        self._rings: dict[Topic, OrderedDict[Key, Message]] = {topic: OrderedDict() for topic in inputs[1:]}
+        self._rings: dict[Topic[Any], OrderedDict[Key, Message]] = {topic: OrderedDict() for topic in inputs[1:]}
         self._waiting: OrderedDict[Key, _Waiting] = OrderedDict()
         self._timeout_ns = round(timeout_s * 1e9)
 
-    def add(self, topic: Topic, message: Message, now_ns: int) -> Iterator[Joined]:
+    def add(self, topic: Topic[Any], message: Message, now_ns: int) -> Iterator[Joined]:
         """Take a message in; give what is complete with it, and what fell out of a full buffer."""
-        if topic == self._primary:
+        if topic is self._primary:
             self._waiting[_key(topic, message.header)] = _Waiting(message, now_ns + self._timeout_ns)
         else:
             self._keep(topic, message)
@@ -54,7 +75,7 @@ class Joiner:
         late = [key for key, waiting in self._waiting.items() if waiting.deadline_ns <= now_ns]
         yield from [self._release(key) for key in late]
 
-    def _keep(self, topic: Topic, message: Message) -> None:
+    def _keep(self, topic: Topic[Any], message: Message) -> None:
         ring = self._rings[topic]
         key = _key(topic, message.header)
         ring[key] = message
@@ -62,26 +83,26 @@ class Joiner:
         if len(ring) > kept(topic):
             ring.popitem(last=False)
 
-    def _missing(self, key: Key) -> tuple[Topic, ...]:
+    def _missing(self, key: Key) -> tuple[Topic[Any], ...]:
         header = self._waiting[key].message.header
         return tuple(topic for topic, ring in self._rings.items() if _key(topic, header) not in ring)
 
     def _release(self, key: Key) -> Joined:
         missing = self._missing(key)
         message = self._waiting.pop(key).message
-        inputs = {self._primary: message}
+        inputs: dict[Topic[Any], Message] = {self._primary: message}
         for topic, ring in self._rings.items():
             ring_key = _key(topic, message.header)
-            found = ring.get(ring_key) if topic == FRAME else ring.pop(ring_key, None)
+            found = ring.get(ring_key) if topic.of_frame else ring.pop(ring_key, None)
             if found is not None:
                 inputs[topic] = found
-        return Joined(inputs, missing)
+        return Joined(message.header, inputs, missing)
 
 
-def kept(topic: Topic) -> int:
+def kept(topic: Topic[Any]) -> int:
     """How many messages of an input a join keeps; of a newest-only topic too, for any may be the one wanted."""
     return JOIN_CAPACITY if topic.newest_only else topic.capacity
 
 
-def _key(topic: Topic, header: Header) -> Key:
-    return header.frame_id, 0 if topic == FRAME else header.pass_index, header.capture_ns
+def _key(topic: Topic[Any], header: Header) -> Key:
+    return header.frame_id, 0 if topic.of_frame else header.pass_index, header.capture_ns

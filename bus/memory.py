@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from fieldpose.bus.protocol import Closer, Closing, Sink, Watcher, key_matches
 from fieldpose.bus.topics import Topic
@@ -31,7 +31,7 @@ class MemoryBus:
         self._room: _Room = neighbour._room if neighbour is not None else _Room()
         self._mine: list[Closer] = []
 
-    def put(self, key: str, payload: bytes, topic: Topic | None = None) -> None:
+    def put(self, key: str, payload: bytes, topic: Topic[Any] | None = None) -> None:
         with self._room.lock:
             sinks = [sink for pattern, sink in self._room.sinks if key_matches(pattern, key)]
         now_ns = time.time_ns()

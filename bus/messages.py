@@ -14,19 +14,24 @@ from typing import Any, ClassVar, Literal
 import msgspec
 import numpy as np
 
+from fieldpose.stages.geometry.cameras import Camera
+
 
 class Reason(StrEnum):
-    """Why a stage could not do its work; `OK` where it could."""
+    """Why there is no result."""
 
-    OK = "ok"
+    INPUT_MISSING = "input_missing"
     FRAME_MISSING = "frame_missing"
     FRAME_UNREADABLE = "frame_unreadable"
+    NOT_AVAILABLE = "not_available"
     NOTHING_ALIKE = "nothing_alike"
     NOTHING_IN_VIEW = "nothing_in_view"
     TOO_FEW_MATCHES = "too_few_matches"
     TOO_FEW_CONSISTENT_POINTS = "too_few_consistent_points"
     NO_CONSENSUS = "no_consensus"
     IMPLAUSIBLE_POSE = "implausible_pose"
+    NO_ANSWER = "no_answer"
+    NO_GUESS = "no_guess"
     INTERNAL_ERROR = "internal_error"
 
 
@@ -47,23 +52,13 @@ class TrackingState(StrEnum):
     LOST = "lost"
 
 
-class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Pinhole intrinsics in pixels, pixel (0, 0) at the centre of the top-left pixel; OpenCV k1 k2 p1 p2 k3."""
+class CameraOrigin(StrEnum):
+    """Where a frame's intrinsics come from; those that were assumed make no pose certain."""
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
-        if not np.all(np.isfinite(numbers)):
-            raise ValueError("camera: intrinsics and distortion must be finite")
-        if not (0 < self.width <= 16384 and 0 < self.height <= 16384 and self.fx > 0 and self.fy > 0):
-            raise ValueError("camera: width, height (1 to 16384), fx and fy must be positive")
+    CALIBRATED = "calibrated"
+    TRAINING = "training"
+    EXIF = "exif"
+    ASSUMED = "assumed"
 
 
 class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -127,12 +122,20 @@ class Frame(Message, kw_only=True):
 
     image: np.ndarray
     encoding: Literal["rgb8", "jpeg", "png"]
-    camera: CameraModel
+    camera: Camera
+    camera_origin: CameraOrigin = CameraOrigin.CALIBRATED
 
     def __post_init__(self) -> None:
         super().__post_init__()
         shape = (self.camera.height, self.camera.width, 3) if self.encoding == "rgb8" else (None,)
         check_array("image", self.image, "uint8", shape)
+
+
+class CameraInfo(Message, kw_only=True):
+    """A frame without its pixels, for who needs none; it is sent right after the frame."""
+
+    camera: Camera
+    camera_origin: CameraOrigin = CameraOrigin.CALIBRATED
 
 
 class Truth(Message, kw_only=True):
@@ -142,20 +145,20 @@ class Truth(Message, kw_only=True):
     _arrays: ClassVar = {"cam_from_object": POSE}
 
 
-class Guess(Message, kw_only=True):
-    """The pose to render for an admitted frame, and the camera that the frame was taken with."""
+class Prior(Message, kw_only=True):
+    """A guess of a frame's pose from outside: an inertial sensor, a robot arm's kinematics, or an evaluation."""
 
-    reason: GuessReason
     cam_from_object: np.ndarray
-    camera: CameraModel
     _arrays: ClassVar = {"cam_from_object": POSE}
+
+
+class Search(Message, kw_only=True):
+    """Asks which training views look like the frame."""
 
 
 class Retrieved(Message, kw_only=True):
     """Training views that look like a frame, the most alike first; similarity in 0..1."""
 
-    ok: bool
-    reason: Reason
     cam_from_object: np.ndarray
     similarity: np.ndarray
     _arrays: ClassVar = {"cam_from_object": ("float64", (None, 4, 4)), "similarity": ("float32", (None,))}
@@ -165,17 +168,24 @@ class Retrieved(Message, kw_only=True):
         check_equal("length", {name: len(getattr(self, name)) for name in self._arrays})
 
 
+class Guess(Message, kw_only=True):
+    """The pose to render for an admitted frame, and the camera that the frame was taken with."""
+
+    reason: GuessReason
+    cam_from_object: np.ndarray
+    camera: Camera
+    _arrays: ClassVar = {"cam_from_object": POSE}
+
+
 class View(Message, kw_only=True):
     """The field rendered at `cam_from_object`; depth is along the optical axis, 0 where nothing was hit.
 
-    Renders reused for another guess keep their `view_id`. `camera` has no distortion.
+    Renders reused for another guess keep their `view_id`. `camera` has no distortion; opacity is 0 to 255.
     """
 
-    ok: bool
-    reason: Reason
     view_id: str
     cam_from_object: np.ndarray
-    camera: CameraModel
+    camera: Camera
     rgb: np.ndarray
     depth: np.ndarray
     opacity: np.ndarray
@@ -189,16 +199,12 @@ class View(Message, kw_only=True):
     def __post_init__(self) -> None:
         super().__post_init__()
         sizes = {name: getattr(self, name).shape[:2] for name in ("rgb", "depth", "opacity")}
-        if self.ok:
-            sizes["camera"] = (self.camera.height, self.camera.width)
-        check_equal("size", sizes)
+        check_equal("size", {**sizes, "camera": (self.camera.height, self.camera.width)})
 
 
 class Matches(Message, kw_only=True):
     """Pixels of the view and of the frame that show the same surface point; confidence in 0..1."""
 
-    ok: bool
-    reason: Reason
     view_id: str
     pixels_in_view: np.ndarray
     pixels_in_frame: np.ndarray
@@ -215,19 +221,19 @@ class Matches(Message, kw_only=True):
 
 
 class Correspondences(Message, kw_only=True):
-    """Matches lifted to the object: `consistency` is the paper's m in squared field units; `kept`: below gamma."""
+    """Matches lifted to the object: `consistency` is the paper's m in squared field units; `kept`: below gamma.
 
-    ok: bool
-    reason: Reason
-    camera: CameraModel
-    guess_cam_from_object: np.ndarray
+    view_cam_from_object: where the view was rendered that they were lifted from.
+    """
+
+    view_cam_from_object: np.ndarray
     pixels_in_frame: np.ndarray
     points_in_object: np.ndarray
     confidence: np.ndarray
     consistency: np.ndarray
     kept: np.ndarray
     _arrays: ClassVar = {
-        "guess_cam_from_object": POSE,
+        "view_cam_from_object": POSE,
         "pixels_in_frame": ("float32", (None, 2)),
         "points_in_object": ("float32", (None, 3)),
         "confidence": ("float32", (None,)),
@@ -237,7 +243,7 @@ class Correspondences(Message, kw_only=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        rows = [name for name in self._arrays if name != "guess_cam_from_object"]
+        rows = [name for name in self._arrays if name != "view_cam_from_object"]
         check_equal("length", {name: len(getattr(self, name)) for name in rows})
 
 
@@ -247,14 +253,11 @@ class Estimate(Message, kw_only=True):
     correspondences: how many points the inliers were among, landmarks of the view that were looked for included.
     """
 
-    ok: bool
-    reason: Reason
-    cam_from_object: np.ndarray | None
-    covariance: np.ndarray | None
-    camera: CameraModel
+    cam_from_object: np.ndarray
+    covariance: np.ndarray
     inliers_in_frame: np.ndarray
     correspondences: int
-    residual_px: float | None
+    residual_px: float
     _arrays: ClassVar = {
         "cam_from_object": POSE,
         "covariance": COVARIANCE,
@@ -263,28 +266,41 @@ class Estimate(Message, kw_only=True):
 
 
 class Pose(Message, kw_only=True):
-    """The result for a frame and pass: the estimate, or its refinement where that made the loss smaller."""
+    """The result for a frame and pass: the estimate, or its refinement where that made the loss smaller.
 
-    ok: bool
-    reason: Reason
-    cam_from_object: np.ndarray | None
-    covariance: np.ndarray | None
+    Losses are None where no refinement was tried.
+    """
+
+    cam_from_object: np.ndarray
+    covariance: np.ndarray
     inliers: int
     correspondences: int
-    residual_px: float | None
+    residual_px: float
     refined: bool
     loss_before: float | None
     loss_after: float | None
     _arrays: ClassVar = {"cam_from_object": POSE, "covariance": COVARIANCE}
 
 
+class Failure(Message, kw_only=True):
+    """A stage has no result for a frame and pass; nothing follows from it, and tracking decides what is next."""
+
+    stage: str
+    reason: Reason
+
+
 class State(Message, kw_only=True):
-    """What tracking believes after each frame, and what it has counted at its door since it started."""
+    """What tracking believes after each frame, and what it has counted at its door since it started.
+
+    A pose with a score of 0 was not measured but carried on from before; `reason` says why nothing was measured.
+    """
 
     state: TrackingState
     score: float
     cam_from_object: np.ndarray | None
     covariance: np.ndarray | None
+    reason: Reason | None = None
+    camera_origin: CameraOrigin = CameraOrigin.CALIBRATED
     in_flight: int
     admitted: int
     finished: int

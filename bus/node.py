@@ -10,23 +10,23 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import psutil
 
-from fieldpose.bus.errors import CodecError
 from fieldpose.bus.joining import Joined, Joiner, kept
 from fieldpose.bus.logs import Throttle, stage_logger
-from fieldpose.bus.messages import Header, Message, Reason, Stats
+from fieldpose.bus.messages import Failure, Message, Reason, Stats
 from fieldpose.bus.ports import Inbox, InboxCounts, Outbox, first_header, reply_header
 from fieldpose.bus.protocol import SETTLE_S, Bus
 from fieldpose.bus.signals import Interrupted, StopSignals
-from fieldpose.bus.topics import FRAME, STATS, Address, Topic
+from fieldpose.bus.topics import FAILURE, FRAME, STATS, Address, Topic
+from fieldpose.errors import CodecError
 
-__all__ = ["EndOfInput", "Handler", "JoinedHandler", "Output", "first_header", "reply_header", "run_node"]
+__all__ = ["EndOfInput", "Handler", "Joined", "JoinedHandler", "Output", "first_header", "reply_header", "run_node"]
 
-Output = tuple[Topic, Message]
+Output = tuple[Topic[Any], Message]
 
 TICK_S = 0.02
 STATS_PERIOD_S = 0.5
@@ -40,14 +40,22 @@ class EndOfInput(Exception):  # noqa: N818 - as StopIteration, it is no failure
 class Handler(Protocol):
     """What a stage does; all methods are called from one thread."""
 
-    name: str
-    inputs: tuple[Topic, ...]
-    outputs: tuple[Topic, ...]
+    @property
+    def name(self) -> str:
+        """The process's name on the bus."""
+
+    @property
+    def inputs(self) -> tuple[Topic[Any], ...]:
+        """What it reads."""
+
+    @property
+    def outputs(self) -> tuple[Topic[Any], ...]:
+        """What it may send."""
 
     def start(self) -> None:
         """Load, compile, warm up; the process is not ready before this returns."""
 
-    def handle(self, topic: Topic, message: Message) -> Iterable[Output]:
+    def handle(self, topic: Topic[Any], message: Message) -> Iterable[Output]:
         """Answer a message; an exception is counted as failed and the process goes on."""
 
     def tick(self, now_ns: int) -> Iterable[Output]:
@@ -60,13 +68,15 @@ class Handler(Protocol):
 class JoinedHandler:
     """A handler that gets its inputs joined by frame and pass, and never answers with silence.
 
-    `inputs[0]` drives: each of its messages is answered once. A subclass sets `name`, `inputs` and `outputs`, and
-    implements `process` and `failure`; both may be generators. One that defines `__init__` calls this one's.
+    `inputs[0]` drives: each of its messages is answered once, on `output` or with a Failure. A subclass sets `name`,
+    `inputs` and `output`, and `optional` for inputs that it can do without, and implements `answer`. One that defines
+    `__init__` calls this one's.
     """
 
     name: str
-    inputs: tuple[Topic, ...]
-    outputs: tuple[Topic, ...]
+    inputs: tuple[Topic[Any], ...]
+    output: Topic[Any]
+    optional: tuple[Topic[Any], ...] = ()
     join_timeout_s: float = 1.0
 
     def __init__(self) -> None:
@@ -74,48 +84,47 @@ class JoinedHandler:
         self._joiner = Joiner(self.inputs, self.join_timeout_s)
         self._throttle = Throttle(stage_logger(self.name))
 
+    @property
+    def outputs(self) -> tuple[Topic[Any], ...]:
+        """What it sends."""
+        return (self.output, FAILURE)
+
     def start(self) -> None:
         """Nothing to load unless a subclass says so."""
 
     def stop(self) -> None:
         """Nothing to let go unless a subclass says so."""
 
-    def process(self, joined: dict[Topic, Message]) -> Iterable[Output]:
-        """Answer the joined inputs; the driving one has not `ok=false`. An exception becomes INTERNAL_ERROR."""
+    def answer(self, joined: Joined) -> Message | Reason:
+        """The message for the joined inputs, or why there is none. An exception becomes INTERNAL_ERROR."""
         raise NotImplementedError
 
-    def failure(self, header: Header, reason: Reason) -> Iterable[Output]:
-        """The ok=false answer to the driving message with that header."""
-        raise NotImplementedError
-
-    def incomplete(self, joined: dict[Topic, Message], reason: Reason) -> Iterable[Output]:
-        """The answer where an input did not come in time; a failure unless a subclass can do with less."""
-        return self.failure(joined[self.inputs[0]].header, reason)
-
-    def handle(self, topic: Topic, message: Message) -> Iterator[Output]:
-        if topic is self.inputs[0] and not getattr(message, "ok", True):
-            # Upstream's failure is passed on with its reason; nothing else is needed for that.
-            yield from self.failure(message.header, getattr(message, "reason", Reason.INTERNAL_ERROR))
-            return
+    def handle(self, topic: Topic[Any], message: Message) -> Iterator[Output]:
         for joined in self._joiner.add(topic, message, time.time_ns()):
-            yield from self._answer(joined)
+            yield self._reply(joined)
 
     def tick(self, now_ns: int) -> Iterator[Output]:
         for joined in self._joiner.expire(now_ns):
-            yield from self._answer(joined)
+            yield self._reply(joined)
 
-    def _answer(self, joined: Joined) -> Iterator[Output]:
-        reason = Reason.FRAME_MISSING if FRAME in joined.missing else Reason.INTERNAL_ERROR
+    def _reply(self, joined: Joined) -> Output:
+        answer = self._answered(joined)
+        if isinstance(answer, Reason):
+            return FAILURE, Failure(header=joined.header, stage=self.name, reason=answer)
+        return self.output, answer
+
+    def _answered(self, joined: Joined) -> Message | Reason:
+        needed = [topic for topic in joined.missing if topic not in self.optional]
         if joined.missing:
-            names = ", ".join(topic.name for topic in joined.missing)
-            self._throttle.warning("input missing", inputs=names)
+            self._throttle.warning("input missing", inputs=", ".join(topic.name for topic in joined.missing))
+        if needed:
+            return Reason.FRAME_MISSING if FRAME in needed else Reason.INPUT_MISSING
         try:
-            # All of it before the first is sent, so that a failure half way is one answer and not two.
-            yield from list(self.incomplete(joined.inputs, reason) if joined.missing else self.process(joined.inputs))
+            return self.answer(joined)
         except Exception as error:
             self.failed += 1
             self._throttle.warning("failed", error=describe(error))
-            yield from self.failure(joined.inputs[self.inputs[0]].header, Reason.INTERNAL_ERROR)
+            return Reason.INTERNAL_ERROR
 
 
 def describe(error: BaseException) -> str:
@@ -216,7 +225,7 @@ class _Node:
         if self._outbox.published > before:
             self._busy_ms.append((time.perf_counter() - started) * 1e3)
 
-    def _refused(self, topic: Topic, error: CodecError) -> None:
+    def _refused(self, topic: Topic[Any], error: CodecError) -> None:
         self._throttle.warning("refused", topic=topic.name, error=str(error))
 
     def _send_stats(self, ready: bool) -> None:

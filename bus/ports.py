@@ -8,15 +8,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
 from fieldpose.bus.codec import decode, encode
-from fieldpose.bus.errors import CodecError
 from fieldpose.bus.messages import Header, Message
 from fieldpose.bus.topics import Address, Topic
 from fieldpose.bus.transport import Bus, Closing
+from fieldpose.errors import CodecError
 
 
 def first_header(frame_id: int, capture_ns: int, pass_index: int = 0) -> Header:
@@ -39,7 +39,7 @@ class Outbox:
         self._source = source
         self._sequence: dict[str, int] = {}
 
-    def publish(self, topic: Topic, message: Message) -> None:
+    def publish(self, topic: Topic[Any], message: Message) -> None:
         """Send `message` with source, sequence and sending time filled in. Raises CodecError, TransportError."""
         sequence = self._sequence.get(topic.name, 0)
         sent = copy.copy(message)
@@ -108,9 +108,9 @@ class Inbox:
         self,
         bus: Bus,
         address: Address,
-        topics: Iterable[Topic],
-        capacities: Mapping[Topic, int] | None = None,
-        refused: Callable[[Topic, CodecError], None] | None = None,
+        topics: Iterable[Topic[Any]],
+        capacities: Mapping[Topic[Any], int] | None = None,
+        refused: Callable[[Topic[Any], CodecError], None] | None = None,
     ) -> None:
         self.counts = InboxCounts()
         self._sequences = Sequences()
@@ -160,7 +160,7 @@ class Inbox:
 
         return sink
 
-    def _take(self, timeout_s: float) -> tuple[Topic, str, bytes, int] | None:
+    def _take(self, timeout_s: float) -> tuple[Topic[Any], str, bytes, int] | None:
         with self._arrived:
             if not any(queue.items for queue in self._queues) and timeout_s > 0:
                 self._arrived.wait(timeout_s)
@@ -170,7 +170,7 @@ class Inbox:
             queue = min(waiting, key=lambda queue: queue.items[0][0])
             return queue.topic, *queue.items.popleft()[1:]
 
-    def _decode(self, topic: Topic, key: str, payload: bytes, received_ns: int) -> Received | None:
+    def _decode(self, topic: Topic[Any], key: str, payload: bytes, received_ns: int) -> Received | None:
         try:
             message = decode(payload, topic.message_type, topic.max_bytes)
         except CodecError as error:

@@ -18,8 +18,8 @@ from typing import Annotated
 
 import msgspec
 
-from fieldpose.bus.errors import TransportError
 from fieldpose.bus.protocol import SETTLE_S, Closer, Closing, Watcher, key_matches
+from fieldpose.errors import TransportError
 
 _Key = Annotated[str, msgspec.Meta(max_length=512)]
 _PAUSES_S = (0.02, 0.32)

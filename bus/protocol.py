@@ -5,10 +5,10 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable
-from typing import Protocol
+from typing import Any, Protocol
 
-from fieldpose.bus.errors import TransportError
 from fieldpose.bus.topics import Address, Topic
+from fieldpose.errors import TransportError
 
 SETTLE_S = 2.0
 
@@ -28,7 +28,7 @@ class Closing(Protocol):
 class Bus(Protocol):
     """Bytes by key, and tokens that live as long as their process; a "*" in a key listens to any one part."""
 
-    def put(self, key: str, payload: bytes, topic: Topic | None = None) -> None:
+    def put(self, key: str, payload: bytes, topic: Topic[Any] | None = None) -> None:
         """Send with the topic's priority, or without one ahead of every topic; nobody says whether it was received."""
 
     def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fieldpose.bus.codec import decode_header
-from fieldpose.bus.errors import CodecError, RecordingError
 from fieldpose.bus.messages import Header, Message
 from fieldpose.bus.node import Output
 from fieldpose.bus.protocol import Bus, Closing, Sink
 from fieldpose.bus.recording import RecordingWriter, partial_path, recover
 from fieldpose.bus.topics import ALL, Address, Topic
+from fieldpose.errors import CodecError, RecordingError
 
 __all__ = ["RECORDED", "Recorder", "RecorderHandler", "RecordingWriter", "partial_path", "recover"]
 
-RECORDED: tuple[Topic, ...] = tuple(topic for topic in ALL if topic.recorded)
+RECORDED: tuple[Topic[Any], ...] = tuple(topic for topic in ALL if topic.recorded)
 QUEUE_BYTES = 256 << 20
 _CHANNEL_CAPACITY = 64
 
@@ -94,7 +94,7 @@ class Recorder:
         bus: Bus,
         address: Address,
         path: Path | str,
-        topics: Iterable[Topic] = RECORDED,
+        topics: Iterable[Topic[Any]] = RECORDED,
         queue_bytes: int = QUEUE_BYTES,
         **options: Any,
     ) -> None:
@@ -127,7 +127,7 @@ class Recorder:
         except OSError as error:
             raise self._failure(error) from error
 
-    def _sink(self, topic: Topic) -> Sink:
+    def _sink(self, topic: Topic[Any]) -> Sink:
         def sink(key: str, payload: bytes, received_ns: int) -> None:
             if not self._queue.put(_Item(key, topic, payload, received_ns)):
                 with suppress(CodecError):
@@ -166,8 +166,8 @@ class RecorderHandler:
     """A recorder as a process of its own; it listens from when it is made and finishes the file when stopped."""
 
     name = "recorder"
-    inputs: tuple[Topic, ...] = ()
-    outputs: tuple[Topic, ...] = ()
+    inputs: tuple[Topic[Any], ...] = ()
+    outputs: tuple[Topic[Any], ...] = ()
 
     def __init__(self, bus: Bus, address: Address, path: Path | str, **options: Any) -> None:
         self._recorder = Recorder(bus, address, path, **options)
@@ -175,7 +175,7 @@ class RecorderHandler:
     def start(self) -> None:
         """Nothing to load."""
 
-    def handle(self, topic: Topic, message: Message) -> Iterable[Output]:
+    def handle(self, topic: Topic[Any], message: Message) -> Iterable[Output]:
         return ()
 
     def tick(self, now_ns: int) -> Iterable[Output]:

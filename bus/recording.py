@@ -7,16 +7,17 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 from mcap.writer import CompressionType, Writer
 
 from fieldpose.bus.codec import decode, encode
-from fieldpose.bus.errors import CodecError, RecordingError
 from fieldpose.bus.messages import Header, Message
 from fieldpose.bus.ports import Sequences
 from fieldpose.bus.replay import RECORDING_RECORD, SOURCE_RECORD, Attachment, Salvage
 from fieldpose.bus.topics import Topic, topic_of
+from fieldpose.errors import CodecError, RecordingError
 
 _CHUNK_BYTES = 2 << 20
 _FLUSH_S = 1.0
@@ -83,11 +84,11 @@ class RecordingWriter:
         for attachment in attachments:
             self._writer.add_attachment(now_ns, now_ns, attachment.name, attachment.media_type, attachment.data)
 
-    def write(self, key: str, topic: Topic, message: Message, log_time_ns: int) -> None:
+    def write(self, key: str, topic: Topic[Any], message: Message, log_time_ns: int) -> None:
         """Write a message under its own header."""
         self._put(key, topic, encode(message), message.header, log_time_ns)
 
-    def write_payload(self, key: str, topic: Topic, payload: bytes, log_time_ns: int) -> None:
+    def write_payload(self, key: str, topic: Topic[Any], payload: bytes, log_time_ns: int) -> None:
         """Write bytes from the wire as they are; those that are no message are refused and counted."""
         try:
             header = decode(payload, topic.message_type, topic.max_bytes).header
@@ -125,7 +126,7 @@ class RecordingWriter:
         self._stream.close()
         self._partial.unlink()
 
-    def _put(self, key: str, topic: Topic, payload: bytes, header: Header, log_time_ns: int) -> None:
+    def _put(self, key: str, topic: Topic[Any], payload: bytes, header: Header, log_time_ns: int) -> None:
         self._sequences.seen(key, header)
         tally = self._tally(key, header)
         tally.received += 1
@@ -149,7 +150,7 @@ class RecordingWriter:
     def _tally(self, key: str, header: Header) -> _Tally:
         return self._tallies.setdefault((key, header.source), _Tally())
 
-    def _register(self, key: str, topic: Topic) -> int:
+    def _register(self, key: str, topic: Topic[Any]) -> int:
         if topic.message_type not in self._schemas:
             schema = schema_of(topic.message_type)
             self._schemas[topic.message_type] = self._writer.register_schema(

@@ -11,7 +11,7 @@ from collections.abc import Container, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mcap.exceptions
 from mcap import records
@@ -20,11 +20,11 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import MCAP0_MAGIC
 
 from fieldpose.bus.codec import decode
-from fieldpose.bus.errors import CodecError, RecordingError
 from fieldpose.bus.messages import Message
 from fieldpose.bus.ports import Outbox
 from fieldpose.bus.protocol import Bus
 from fieldpose.bus.topics import Address, Topic, topic_of
+from fieldpose.errors import CodecError, RecordingError
 
 SOURCE_RECORD = "fieldpose.source"
 RECORDING_RECORD = "fieldpose.recording"
@@ -93,7 +93,7 @@ class RecordingInfo:
     attachments: dict[str, int] = field(default_factory=dict)
 
 
-def read_recording(path: Path | str, topics: Container[Topic] | None = None) -> Iterator[Recorded]:
+def read_recording(path: Path | str, topics: Container[Topic[Any]] | None = None) -> Iterator[Recorded]:
     """The messages of a recording in the order of their receipt, of `topics` alone where given.
 
     Raises RecordingError for a file that is no whole recording, or holds a message that is none of its topic.
@@ -146,7 +146,7 @@ def read_attachment(path: Path | str, name: str) -> bytes:
 def replay(
     bus: Bus,
     path: Path | str,
-    topics: Container[Topic],
+    topics: Container[Topic[Any]],
     rate: float | None = 1.0,
     address: Address | None = None,
     source: str = "replay",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Generic, Literal, TypeVar
 
 from fieldpose.bus import messages
-from fieldpose.bus.errors import TransportError
+from fieldpose.errors import TransportError
+
+M = TypeVar("M", bound=messages.Message)
 
 _PART_OF_KEY = r"[A-Za-z0-9_.\-]+"
 _PART = re.compile(_PART_OF_KEY + r"|\*")
@@ -25,7 +27,7 @@ class Address:
         for name in ("site", "object", "camera"):
             _check_part(name, getattr(self, name))
 
-    def key(self, topic: Topic, stage: str = "*") -> str:
+    def key(self, topic: Topic[Any], stage: str = "*") -> str:
         """The key of `topic` here; only the key of STATS names the stage that sends it."""
         _check_part("stage", stage)
         return topic.template.format(site=self.site, object=self.object, camera=self.camera, stage=stage)
@@ -42,20 +44,22 @@ def _check_part(name: str, part: str) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Topic:
-    """A row of the table; each topic is one object, compared by identity.
+class Topic(Generic[M]):
+    """A row of the table, generic in its message; each topic is one object, compared by identity.
 
     `capacity` bounds a receiver's queue, in messages: the oldest is dropped for a newer one, so 1 is newest-only.
-    A stage that joins several inputs keeps `JOIN_CAPACITY` of a newest-only topic instead.
+    A stage that joins several inputs keeps `JOIN_CAPACITY` of a newest-only topic instead. `of_frame`: there is one a
+    frame, whatever pass over it is asked for.
     """
 
     name: str
     template: str
-    message_type: type[messages.Message]
+    message_type: type[M]
     capacity: int = 64
     max_bytes: int = 4 << 20
     priority: Literal["data", "data_low"] = "data"
     recorded: bool = True
+    of_frame: bool = False
 
     @property
     def newest_only(self) -> bool:
@@ -72,28 +76,36 @@ _GROUPS = {name: f"(?P<{name}>{_PART_OF_KEY})" for name in ("site", "object", "c
 JOIN_CAPACITY = 64
 
 _PIPELINE = "{site}/track/{object}/{camera}/"
-_IMAGE_BYTES = 80 << 20
+_IMAGE_BYTES, _SMALL = 80 << 20, 64 << 10
 
 FRAME = Topic(
-    "frame", "{site}/camera/{camera}/frame", messages.Frame, capacity=1, max_bytes=_IMAGE_BYTES, priority="data_low"
+    "frame", "{site}/camera/{camera}/frame", messages.Frame, capacity=1, max_bytes=_IMAGE_BYTES, priority="data_low",
+    of_frame=True,
+)  # fmt: skip
+CAMERA_INFO = Topic(
+    "camera_info", "{site}/camera/{camera}/info", messages.CameraInfo, capacity=1, max_bytes=_SMALL, of_frame=True
 )
-TRUTH = Topic("truth", _PIPELINE + "truth", messages.Truth, max_bytes=64 << 10)
-GUESS = Topic("guess", _PIPELINE + "guess", messages.Guess, max_bytes=64 << 10)
-RETRIEVED = Topic("retrieved", _PIPELINE + "retrieved", messages.Retrieved, max_bytes=64 << 10)
+TRUTH = Topic("truth", _PIPELINE + "truth", messages.Truth, max_bytes=_SMALL, of_frame=True)
+PRIOR = Topic("prior", _PIPELINE + "prior", messages.Prior, max_bytes=_SMALL, of_frame=True)
+SEARCH = Topic("search", _PIPELINE + "search", messages.Search, max_bytes=_SMALL)
+RETRIEVED = Topic("retrieved", _PIPELINE + "retrieved", messages.Retrieved, max_bytes=_SMALL)
+GUESS = Topic("guess", _PIPELINE + "guess", messages.Guess, max_bytes=_SMALL)
 VIEW = Topic("view", _PIPELINE + "view", messages.View, capacity=16, max_bytes=_IMAGE_BYTES, priority="data_low")
 MATCHES = Topic("matches", _PIPELINE + "matches", messages.Matches)
 CORRESPONDENCES = Topic("correspondences", _PIPELINE + "correspondences", messages.Correspondences)
 ESTIMATE = Topic("estimate", _PIPELINE + "estimate", messages.Estimate)
-POSE = Topic("pose", _PIPELINE + "pose", messages.Pose, max_bytes=64 << 10)
-STATE = Topic("state", _PIPELINE + "state", messages.State, max_bytes=64 << 10)
+POSE = Topic("pose", _PIPELINE + "pose", messages.Pose, max_bytes=_SMALL)
+FAILURE = Topic("failure", _PIPELINE + "failure", messages.Failure, max_bytes=_SMALL)
+STATE = Topic("state", _PIPELINE + "state", messages.State, max_bytes=_SMALL)
 STATS = Topic("stats", "{site}/stats/{object}/{camera}/{stage}", messages.Stats, capacity=256, max_bytes=16 << 10)
 
-ALL: tuple[Topic, ...] = (
-    FRAME, TRUTH, GUESS, RETRIEVED, VIEW, MATCHES, CORRESPONDENCES, ESTIMATE, POSE, STATE, STATS,
+ALL: tuple[Topic[Any], ...] = (
+    FRAME, CAMERA_INFO, TRUTH, PRIOR, SEARCH, RETRIEVED, GUESS, VIEW, MATCHES, CORRESPONDENCES, ESTIMATE, POSE, FAILURE,
+    STATE, STATS,
 )  # fmt: skip
-BY_NAME: dict[str, Topic] = {topic.name: topic for topic in ALL}
+BY_NAME: dict[str, Topic[Any]] = {topic.name: topic for topic in ALL}
 
 
-def topic_of(key: str) -> Topic | None:
+def topic_of(key: str) -> Topic[Any] | None:
     """The topic that a concrete key belongs to, None where it is none of ours."""
     return next((topic for topic in ALL if topic.address_of(key)), None)

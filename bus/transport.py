@@ -14,12 +14,12 @@ from typing import Any
 
 import zenoh
 
-from fieldpose.bus.errors import TransportError
 from fieldpose.bus.memory import MemoryBus
 from fieldpose.bus.presence import Presence
 from fieldpose.bus.protocol import Bus, Closer, Closing, Sink, Watcher, wait_for
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Topic
+from fieldpose.errors import TransportError
 
 __all__ = [
     "LOCAL_HUB", "Bus", "Closing", "MemoryBus", "Sink", "Watcher", "ZenohBus", "log_to_stderr", "serve_hub",
@@ -76,7 +76,7 @@ class ZenohBus:
                 )
             time.sleep(0.005)
 
-    def put(self, key: str, payload: bytes, topic: Topic | None = None) -> None:
+    def put(self, key: str, payload: bytes, topic: Topic[Any] | None = None) -> None:
         try:
             with self._declaring:
                 publisher = self._publishers.get(key)

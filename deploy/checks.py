@@ -17,9 +17,8 @@ from typing import Literal
 
 import psutil
 
-from fieldpose.bus.errors import FieldposeError
 from fieldpose.deploy.processes.endpoints import free_port
-from fieldpose.stages.errors import StageError
+from fieldpose.errors import FieldposeError
 
 _PACKAGES = ("torch", "kornia", "numba", "numpy", "opencv-python-headless", "eclipse-zenoh", "mcap", "supervisor")
 _SHARED_MEMORY = Path("/dev/shm")
@@ -97,7 +96,7 @@ def weights() -> Iterator[Finding]:
         began = time.perf_counter()
         try:
             build_matcher(MatchingConfig(matcher=name))
-        except StageError as error:
+        except FieldposeError as error:
             yield Finding(f"matcher {name}", "failed" if name == default else "note", str(error))
         else:
             yield Finding(f"matcher {name}", "ok", f"loaded in {time.perf_counter() - began:.1f} s")
@@ -133,7 +132,7 @@ def field(path: Path) -> Iterator[Finding]:
 
     try:
         found = load_field(path)
-    except StageError as error:
+    except FieldposeError as error:
         yield Finding("field", "failed", str(error))
         return
     about = found.metadata
@@ -156,7 +155,7 @@ def dataset(path: Path) -> Iterator[Finding]:
         found = load_dataset(path, "all")
         for index in range(len(found)):
             found.load_image(index)
-    except StageError as error:
+    except FieldposeError as error:
         yield Finding("dataset", "failed", str(error))
         return
     test = sum(record.split == "test" for record in found.images)

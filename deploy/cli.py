@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from fieldpose.deploy.errors import UsageError
+from fieldpose.errors import UsageError
 
 COMMANDS = {
     "demo": "the embedded scene through the whole pipeline",
@@ -47,7 +47,9 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout = None
         return 1
     except Exception as error:
-        if not _is_for_the_user(error):
+        from fieldpose.errors import FieldposeError
+
+        if not isinstance(error, FieldposeError):
             raise
         print(f"fieldpose: {' '.join(str(error).split())}", file=sys.stderr)
         return _BAD_INPUT
@@ -127,13 +129,6 @@ def _one_line(framed: str) -> str:
     suggested = next((re.search(r"--[\w.-]+", part) for part in others if part.startswith("Perhaps")), None)
     text = " ".join(first.split())
     return f"{text} (did you mean {suggested.group()}?)" if suggested else text
-
-
-def _is_for_the_user(error: Exception) -> bool:
-    from fieldpose.bus.errors import FieldposeError
-    from fieldpose.stages.errors import StageError
-
-    return isinstance(error, FieldposeError | StageError)
 
 
 def _overview() -> str:

@@ -1,7 +1,11 @@
-"""THE table of processes: what each is made of, whether it needs the field, how many threads it may use.
+"""THE graph: every process, what it reads and writes, and what its handler is made of.
 
-All are started together and restarted when they die. One that ends with exit code 0 has done its work (the camera,
-at the end of its source), one that ends with 2 was given something that only the user can mend; neither comes back.
+Launching, waiting, timing, the commands' choices, thread budgets and the README's picture all follow from the rows.
+The same handlers run as processes over Zenoh (`deploy.processes`) and in one process (`deploy.local`).
+
+Processes are started together and restarted when they die. One that ends with exit code 0 has done its work (the
+camera, at the end of its source), one that ends with 2 was given something that only the user can mend; neither comes
+back.
 """
 
 from __future__ import annotations
@@ -10,11 +14,32 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from fieldpose.bus.node import Handler
 from fieldpose.bus.protocol import Bus
-from fieldpose.deploy.errors import UsageError
-from fieldpose.deploy.settings import Settings
+from fieldpose.bus.topics import (
+    ALL,
+    CAMERA_INFO,
+    CORRESPONDENCES,
+    ESTIMATE,
+    FAILURE,
+    FRAME,
+    GUESS,
+    MATCHES,
+    POSE,
+    PRIOR,
+    RETRIEVED,
+    SEARCH,
+    STATE,
+    STATS,
+    TRUTH,
+    VIEW,
+    Topic,
+)  # fmt: skip
+from fieldpose.deploy.parts import Parts
+from fieldpose.deploy.plan import Plan
+from fieldpose.errors import UsageError
 
 HUB, RECORDER, CAMERA = "hub", "recorder", "camera"
 OBSERVER = "observer"
@@ -24,131 +49,158 @@ _THREAD_VARIABLES = (
     "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS", "VECLIB_MAXIMUM_THREADS",
 )  # fmt: skip
 
+Topics = tuple[Topic[Any], ...]
+
 
 @dataclass(frozen=True)
 class Launch:
-    """What a process is made with; `threads` is its budget, `wait_until_ready` returns once all others are."""
+    """What only a process has: its bus, what it records into, and `wait_until_ready`, which returns once all are."""
 
-    bus: Bus
-    settings: Settings
-    threads: int
-    field: Path | None
-    record: Path | None
-    wait_until_ready: Callable[[], None]
-
-    def needed_field(self) -> Path:
-        """The field. Raises UsageError where none was given."""
-        if self.field is None:
-            raise UsageError("this process needs --field FIELD")
-        return self.field
+    bus: Bus | None = None
+    record: Path | None = None
+    wait_until_ready: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True)
-class ProcessSpec:
-    """A row of the table.
+class Process:
+    """A row of the graph.
 
-    `parallel`: its work can use several threads; `renders`: it runs the field's kernels; `stop_s`: how long it
-    may take to end.
+    reads: all that its handler may join or listen to; one with less to do reads less. needs_field: it cannot start
+    without. renders: it runs the field's kernels. parallel: its work can use several threads. stop_s: how long it may
+    take to end. wanted: whether a plan has work for it.
     """
 
     name: str
-    handler: Callable[[Launch], Handler] | None
-    parallel: bool = False
+    make: Callable[[Parts, Launch], Handler] | None
+    reads: Topics = ()
+    writes: Topics = ()
+    needs_field: bool = False
     renders: bool = False
+    parallel: bool = False
     stop_s: float = 2.0
+    wanted: Callable[[Plan], bool] = lambda plan: True
 
 
-def _recorder(launch: Launch) -> Handler:
+def _recorder(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.bus.recorder import RecorderHandler
     from fieldpose.deploy.reporting.provenance import attachments, metadata
 
-    if launch.record is None:
+    if launch.record is None or launch.bus is None:
         raise UsageError("the recorder needs --record FILE.mcap")
     return RecorderHandler(
         launch.bus,
-        launch.settings.address,
+        parts.settings.address,
         launch.record,
-        metadata=metadata(launch.settings, launch.field),
-        attachments=attachments(launch.settings, launch.field),
+        metadata=metadata(parts.plan),
+        attachments=attachments(parts.plan),
         resume=True,
         from_start=True,
     )
 
 
-def _camera(launch: Launch) -> Handler:
+def _camera(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.camera.node import CameraNode
 
-    return CameraNode(launch.settings.camera, launch.wait_until_ready)
+    return CameraNode(parts.settings.camera, parts.known_cameras, launch.wait_until_ready)
 
 
-def _tracking(launch: Launch) -> Handler:
+def _perturbation(parts: Parts, launch: Launch) -> Handler:
+    from fieldpose.deploy.evaluation.perturbation import PerturbationNode
+
+    return PerturbationNode(parts.plan.begins.disturbance, parts.settings.tracking.seed)
+
+
+def _tracking(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.tracking.node import TrackingNode
 
-    return TrackingNode(launch.needed_field(), launch.settings.tracking)
+    return TrackingNode(parts.tracker)
 
 
-def _retrieval(launch: Launch) -> Handler:
+def _retrieval(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.retrieval.node import RetrievalNode
 
-    return RetrievalNode(launch.needed_field(), launch.settings.retrieval, launch.settings.matching)
+    return RetrievalNode(lambda: parts.training_views, parts.describe, parts.settings.retrieval, parts.images)
 
 
-def _rendering(launch: Launch) -> Handler:
+def _rendering(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.rendering.node import RenderingNode
 
-    return RenderingNode(launch.needed_field(), launch.settings.rendering, launch.threads)
+    return RenderingNode(lambda: parts.views)
 
 
-def _matching(launch: Launch) -> Handler:
-    import torch
-
+def _matching(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.matching.node import MatchingNode
 
-    torch.set_num_threads(launch.threads)
-    return MatchingNode(launch.settings.matching)
+    return MatchingNode(lambda: parts.pairs, parts.images)
 
 
-def _lifting(launch: Launch) -> Handler:
+def _lifting(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.lifting.node import LiftingNode
 
-    return LiftingNode(launch.needed_field(), launch.settings.lifting, launch.threads)
+    return LiftingNode(lambda: parts.renderer, parts.settings.lifting, parts.consistency)
 
 
-def _pnp(launch: Launch) -> Handler:
+def _pnp(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.pnp.node import PnpNode
 
-    return PnpNode(launch.settings.pnp)
+    return PnpNode(parts.settings.pnp, parts.images)
 
 
-def _refinement(launch: Launch) -> Handler:
+def _refinement(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.refinement.node import RefinementNode
 
-    return RefinementNode(launch.needed_field(), launch.settings.refinement, launch.threads)
+    return RefinementNode(lambda: parts.renderer, parts.settings.refinement, parts.images)
 
 
-TABLE: dict[str, ProcessSpec] = {
-    spec.name: spec
-    for spec in (
-        ProcessSpec(HUB, None, stop_s=1.0),
-        ProcessSpec(RECORDER, _recorder, stop_s=60.0),
-        ProcessSpec(CAMERA, _camera),
-        ProcessSpec("tracking", _tracking),
-        ProcessSpec("retrieval", _retrieval),
-        ProcessSpec("rendering", _rendering, parallel=True, renders=True),
-        ProcessSpec("matching", _matching, parallel=True),
-        ProcessSpec("lifting", _lifting, parallel=True, renders=True),
-        ProcessSpec("pnp", _pnp),
-        ProcessSpec("refinement", _refinement, parallel=True, renders=True),
-    )
-}
-STAGES = tuple(name for name in TABLE if name not in (HUB, RECORDER))
-"""The processes that a frame passes."""
+GRAPH: tuple[Process, ...] = (
+    Process(HUB, None, stop_s=1.0),
+    Process(RECORDER, _recorder, reads=tuple(topic for topic in ALL if topic.recorded), stop_s=60.0),
+    Process(CAMERA, _camera, reads=(STATE, POSE, FAILURE), writes=(TRUTH, FRAME, CAMERA_INFO)),
+    Process(
+        "perturbation", _perturbation, reads=(TRUTH,), writes=(PRIOR,),
+        wanted=lambda plan: plan.begins.disturbance is not None,
+    ),
+    Process(
+        "tracking", _tracking, reads=(CAMERA_INFO, PRIOR, RETRIEVED, POSE, FAILURE), writes=(SEARCH, GUESS, STATE),
+        needs_field=True,
+    ),
+    Process(
+        "retrieval", _retrieval, reads=(SEARCH, FRAME), writes=(RETRIEVED, FAILURE), needs_field=True,
+        wanted=lambda plan: plan.looks,
+    ),
+    Process(
+        "rendering", _rendering, reads=(GUESS,), writes=(VIEW, FAILURE), needs_field=True, renders=True, parallel=True
+    ),
+    Process("matching", _matching, reads=(VIEW, FRAME), writes=(MATCHES, FAILURE), parallel=True),
+    Process(
+        "lifting", _lifting, reads=(MATCHES, VIEW), writes=(CORRESPONDENCES, FAILURE), needs_field=True, renders=True,
+        parallel=True,
+    ),
+    Process("pnp", _pnp, reads=(CORRESPONDENCES, VIEW, FRAME), writes=(ESTIMATE, FAILURE)),
+    Process(
+        "refinement", _refinement, reads=(ESTIMATE, FRAME), writes=(POSE, FAILURE), needs_field=True, renders=True,
+        parallel=True,
+    ),
+)  # fmt: skip
+BY_NAME: dict[str, Process] = {row.name: row for row in GRAPH}
+STAGES: tuple[str, ...] = tuple(row.name for row in GRAPH if row.writes)
+"""The processes that take part in the dataflow."""
+BETWEEN_STAGES: Topics = tuple(topic for topic in ALL if topic not in (FRAME, CAMERA_INFO, TRUTH, PRIOR, STATE, STATS))
+"""The topics of a frame on its way from the door to its pose."""
+
+AT_WORK: tuple[str, ...] = tuple(row.name for row in GRAPH if any(topic in BETWEEN_STAGES for topic in row.writes))
+"""The processes that a frame passes on that way."""
 
 
-def threads_of(spec: ProcessSpec, depth: int, cores: int | None = None) -> int:
+def rows_of(plan: Plan, recorded: bool) -> list[Process]:
+    """The processes of a run of a plan, the hub among them."""
+    return [row for row in GRAPH if row.wanted(plan) and (recorded or row.name != RECORDER)]
+
+
+def threads_of(row: Process, depth: int, cores: int | None = None) -> int:
     """A process's budget: with `depth` frames in flight as many processes are at work at once."""
     cores = cores or len(os.sched_getaffinity(0))
-    return max(1, cores // min(depth, cores)) if spec.parallel else 1
+    return max(1, cores // min(depth, cores)) if row.parallel else 1
 
 
 def thread_environment(threads: int) -> dict[str, str]:

@@ -1,41 +1,99 @@
-"""One image through the cores of the stages, in this process and without a bus."""
+"""The graph in one process and one thread: what a handler says is handed to those that read it, as it is."""
 
 from __future__ import annotations
 
+import copy
 import time
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
-from typing import TypeVar
+from typing import Any
 
+import msgspec
 import numpy as np
 
-from fieldpose.bus.messages import GuessReason, Reason
-from fieldpose.deploy.lookalikes import Lookalikes
+from fieldpose.bus.messages import (
+    CameraInfo,
+    CameraOrigin,
+    Frame,
+    Guess,
+    Message,
+    Pose,
+    Prior,
+    Reason,
+    State,
+    TrackingState,
+)  # fmt: skip
+from fieldpose.bus.node import EndOfInput, Handler, Output, first_header
+from fieldpose.bus.topics import CAMERA_INFO, FRAME, PRIOR, Topic
+from fieldpose.deploy.graph import CAMERA, HUB, RECORDER, Launch, rows_of
+from fieldpose.deploy.parts import Parts
+from fieldpose.deploy.plan import resolve
 from fieldpose.deploy.settings import Settings
 from fieldpose.stages.geometry import Camera
-from fieldpose.stages.lifting.core import ConsistencyMemory, Lifted, lift
-from fieldpose.stages.matching.core import PairMatcher, build_matcher
 from fieldpose.stages.nerf.rendering_api import RayRenderer
-from fieldpose.stages.pnp.core import Pictures, PnpResult, solve
-from fieldpose.stages.refinement.core import RefinementResult, refine
-from fieldpose.stages.rendering.core import SourcedView, ViewSource
-from fieldpose.stages.tracking.frame_policies import EachFramePolicy
-from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
-from fieldpose.stages.tracking.views import TrainingViews
-
-T = TypeVar("T")
-
-_FRAME = FrameInfo(frame_id=0, capture_ns=0)
+from fieldpose.stages.nerf.training_views import TrainingViews
 
 
-@dataclass
+@dataclass(frozen=True)
+class Said:
+    """A message on its way, who sent it, and how long its sender was at work."""
+
+    topic: Topic[Any]
+    message: Message
+    sender: str
+    ms: float
+
+
+class LocalPipeline:
+    """The handlers of a plan, but for the camera unless asked for, started. Raises what they raise at start."""
+
+    def __init__(self, parts: Parts, with_camera: bool = False) -> None:
+        left_out = {HUB, RECORDER} if with_camera else {HUB, RECORDER, CAMERA}
+        rows = [row for row in rows_of(parts.plan, recorded=False) if row.name not in left_out]
+        self._handlers: list[Handler] = [row.make(parts, Launch()) for row in rows if row.make is not None]
+        for handler in self._handlers:
+            handler.start()
+
+    def send(self, *outputs: Output) -> Iterator[Said]:
+        """Hand these messages on, and give all that is said because of them, until nothing more is."""
+        waiting = deque(Said(topic, _stamped(message, ""), "", 0.0) for topic, message in outputs)
+        while waiting:
+            said = waiting.popleft()
+            yield said
+            for handler in self._handlers:
+                if said.topic in handler.inputs:
+                    waiting.extend(_timed(handler.name, handler.handle(said.topic, said.message)))
+
+    def play(self) -> Iterator[Said]:
+        """Let the camera send its source to the end, and give all that is said."""
+        try:
+            while True:
+                for handler in self._handlers:
+                    for topic, message in handler.tick(time.time_ns()):
+                        yield from self.send((topic, message))
+        except EndOfInput:
+            return
+
+    def close(self) -> None:
+        """Let go of what the handlers hold."""
+        for handler in self._handlers:
+            handler.stop()
+
+
+@dataclass(frozen=True)
 class PoseFound:
-    """The answer for one image: `reason` says why there is no pose; stage_ms is of the pass that counts."""
+    """The answer for one image: `reason` says why there is no pose.
 
-    reason: Reason
+    cam_from_object (4, 4) in OpenCV axes; covariance (6, 6) of its left twist (translation, rotation), in the field's
+    unit and radians; score in 0..1. stage_ms: the time of each stage, all passes together.
+    """
+
+    reason: Reason | None
     cam_from_object: np.ndarray | None = None
     covariance: np.ndarray | None = None
+    score: float = 0.0
+    state: TrackingState = TrackingState.LOST
     inliers: int = 0
     correspondences: int = 0
     residual_px: float | None = None
@@ -52,17 +110,14 @@ class PoseFound:
 
 
 class PoseFinder:
-    """Renders, matches, lifts, solves and refines, again and from elsewhere until a pose is believed.
+    """Finds the pose of single images: renders, matches, lifts, solves and refines, until a pose is believed.
 
-    `views` are the field's training views. Raises ConfigError and WeightsError.
+    `views` are the field's training views. Raises FieldFileError, ConfigError and WeightsError.
     """
 
-    def __init__(self, renderer: RayRenderer, settings: Settings, views: TrainingViews) -> None:
-        self._renderer, self._settings, self._training_views = renderer, settings, views
-        self._views = ViewSource(renderer, settings.rendering)
-        self._matcher = PairMatcher(build_matcher(settings.matching), settings.matching)
-        self._lookalikes = Lookalikes(views, settings, self._matcher)
-        self._consistency = ConsistencyMemory(len(views.names))
+    def __init__(self, parts: Parts) -> None:
+        self._parts = parts
+        self._pipeline = LocalPipeline(parts)
         self._images = 0
 
     def prepare(self, camera: Camera) -> None:
@@ -70,122 +125,79 @@ class PoseFinder:
 
         An image that is then found from one of them takes a third of the time.
         """
-        rng = np.random.default_rng(self._settings.tracking.seed)
-        for pose in self._training_views.cam_from_object:
-            sourced = self._views.view(camera, pose)
-            features = self._matcher.view_features(sourced.view.rgb, sourced.view.opacity, sourced.view_id)
-            self._lift(sourced, features.pixels, rng)
+        from fieldpose.stages.lifting.core import lift
+        from fieldpose.stages.lifting.node import view_rng
 
-    def find(self, image: np.ndarray, camera: Camera, guess: np.ndarray | None = None) -> PoseFound:
-        """The pose of an image (h, w, 3) uint8 from a guessed cam_from_object (4, 4); see EachFramePolicy.
+        parts = self._parts
+        for pose in parts.training_views.cam_from_object:
+            sourced = parts.views.view(camera, pose)
+            if isinstance(sourced, Reason):
+                continue
+            view, view_id = sourced.view, sourced.view_id
+            opacity = np.rint(view.opacity * 255).astype(np.uint8)
+            pixels = parts.pairs.view_features(view.rgb, opacity, view_id).pixels
+            lift(
+                parts.renderer, view.depth, opacity, view.camera, pose, pixels, view_rng(view_id),
+                parts.settings.lifting, parts.consistency.of(view_id),
+            )  # fmt: skip
 
-        Without a guess it is found from the training views that look like the image; none if the field does not know
-        how they look.
+    def find(
+        self, image: np.ndarray, camera: Camera, guess: np.ndarray | None = None,
+        origin: CameraOrigin = CameraOrigin.CALIBRATED,
+    ) -> PoseFound:  # fmt: skip
+        """The pose of an image (h, w, 3) uint8 from a guessed cam_from_object (4, 4).
+
+        Without a guess it is found from the training views that look like the image. `origin`: where the camera was
+        taken from; one that was assumed makes no pose certain.
         """
+        header = first_header(self._images, self._images)
         self._images += 1
-        clock = _Clock()
+        sent: list[Output] = []
+        if guess is not None:
+            sent.append((PRIOR, Prior(header=header, cam_from_object=np.array(guess, np.float64))))
+        frame = Frame(header=header, image=image, encoding="rgb8", camera=camera, camera_origin=origin)
+        sent += [(FRAME, frame), (CAMERA_INFO, CameraInfo(header=header, camera=camera, camera_origin=origin))]
+        return _found(list(self._pipeline.send(*sent)))
 
-        @cache
-        def alike(frame: FrameInfo) -> list[np.ndarray]:
-            return clock.time("retrieval", lambda: self._lookalikes.of(image, camera, self._images, guess is None))
-
-        if guess is None:
-            likely = alike(_FRAME)
-            if not likely:
-                return PoseFound(Reason.NOTHING_ALIKE, stage_ms=clock.ms)
-            guess = likely[0]
-        policy = EachFramePolicy(self._settings.tracking, self._training_views, {_FRAME.frame_id: guess}, alike)
-        rng = np.random.default_rng(self._settings.tracking.seed)
-        attempt = Attempt(_FRAME, PoseGuess(GuessReason.PRIOR, guess), sent_ns=0)
-        further, tried = policy.first_guess(_FRAME), list[PoseFound]()
-        while further is not None:
-            tried.append(self._one_pass(image, camera, further, rng))
-            result = _result(tried[-1], attempt.pass_index)
-            further = policy.next_guess(attempt, result)
-            if further is not None:
-                attempt = attempt.again(further, now_ns=0)
-        found = _concluded(tried, policy.conclude(attempt, result))
-        return replace(found, stage_ms={**clock.ms, **found.stage_ms})
-
-    def _one_pass(self, image: np.ndarray, camera: Camera, guess: PoseGuess, rng: np.random.Generator) -> PoseFound:
-        """One way through the stages."""
-        clock, next_pass = _Clock(), guess.reason is GuessReason.NEXT_PASS
-        sourced = clock.time("rendering", lambda: self._views.view(camera, guess.cam_from_object, next_pass))
-        if sourced.visible < self._settings.rendering.min_visible:
-            return PoseFound(Reason.NOTHING_IN_VIEW, stage_ms=clock.ms)
-        view = sourced.view
-        matched = clock.time(
-            "matching", lambda: self._matcher.match(view.rgb, view.opacity, image, sourced.view_id, self._images)
-        )
-        if len(matched.confidence) < self._settings.matching.min_matches:
-            return PoseFound(Reason.TOO_FEW_MATCHES, stage_ms=clock.ms)
-        lifted = clock.time("lifting", lambda: self._lift(sourced, matched.pixels_a, rng))
-        kept = lifted.kept
-        if kept.sum() < self._settings.lifting.min_kept:
-            return PoseFound(Reason.TOO_FEW_CONSISTENT_POINTS, stage_ms=clock.ms)
-        pixels, points, confidence = matched.pixels_b[kept], lifted.points_in_object[kept], matched.confidence[kept]
-        seen_from = view.cam_from_object
-        pictures = Pictures(view.rgb, view.depth, view.camera, seen_from, image)
-        solved = clock.time(
-            "pnp", lambda: solve(pixels, points, camera, self._settings.pnp, confidence, seen_from, pictures)
-        )
-        if solved.cam_from_object is None:
-            return PoseFound(Reason(solved.reason), correspondences=solved.correspondences, stage_ms=clock.ms)
-        pose = solved.cam_from_object
-        refined = clock.time(
-            "refinement",
-            lambda: refine(
-                self._renderer, image, camera, pose, solved.inliers_in_frame, rng, self._settings.refinement
-            ),
-        )
-        return _found(solved, refined, clock.ms)
-
-    def _lift(self, sourced: SourcedView, pixels: np.ndarray, rng: np.random.Generator) -> Lifted:
-        view = sourced.view
-        return lift(
-            self._renderer, view.depth, view.opacity, view.camera, view.cam_from_object, pixels, rng,
-            self._settings.lifting, self._consistency.of(sourced.view_id),
-        )  # fmt: skip
+    def close(self) -> None:
+        """Let go of what the handlers hold."""
+        self._pipeline.close()
 
 
-def _result(found: PoseFound, pass_index: int) -> PoseResult:
-    return PoseResult(
-        _FRAME.frame_id, pass_index, found.ok, found.cam_from_object, found.covariance, found.inliers,
-        found.correspondences, found.residual_px,
-    )  # fmt: skip
+def photo_finder(settings: Settings, views: TrainingViews, renderer: RayRenderer) -> PoseFinder:
+    """A finder for photos, each by itself, in a field that is in memory. Raises ConfigError and WeightsError."""
+    photos = replace(settings, tracking=replace(settings.tracking, sequence="photos"))
+    return PoseFinder(Parts(resolve(photos, views), renderer=renderer, views=views, together=True))
 
 
-def _concluded(tried: Sequence[PoseFound], belief: Belief) -> PoseFound:
-    """The one of the passes' results that is believed, else why the first guess has led to none."""
-    first = tried[0]
-    for found in reversed(tried):
-        if found.ok and found.cam_from_object is belief.cam_from_object:
-            return replace(found, covariance=belief.covariance, passes=len(tried))
-    reason = Reason.IMPLAUSIBLE_POSE if first.ok else first.reason
-    return PoseFound(reason, correspondences=first.correspondences, passes=len(tried), stage_ms=first.stage_ms)
+def _stamped(message: Message, source: str) -> Message:
+    """With the sender and the time of sending in its header, as a message on the bus has them."""
+    stamped = copy.copy(message)
+    stamped.header = msgspec.structs.replace(message.header, source=source, sent_ns=time.time_ns())
+    return stamped
 
 
-class _Clock:
-    def __init__(self) -> None:
-        self.ms: dict[str, float] = {}
-
-    def time(self, name: str, work: Callable[[], T]) -> T:
+def _timed(sender: str, outputs: Iterable[Output]) -> Iterator[Said]:
+    began = time.perf_counter()
+    for topic, message in outputs:
+        yield Said(topic, _stamped(message, sender), sender, (time.perf_counter() - began) * 1e3)
         began = time.perf_counter()
-        result = work()
-        self.ms[name] = (time.perf_counter() - began) * 1e3
-        return result
 
 
-def _found(solved: PnpResult, refined: RefinementResult, ms: dict[str, float]) -> PoseFound:
+def _found(said: Sequence[Said]) -> PoseFound:
+    messages = [one.message for one in said]
+    state = next(message for message in messages if isinstance(message, State))
+    passes = sum(isinstance(message, Guess) for message in messages)
+    stage_ms: dict[str, float] = {}
+    for one in said:
+        if one.sender:
+            stage_ms[one.sender] = stage_ms.get(one.sender, 0.0) + one.ms
+    believed = state.cam_from_object
+    poses = [message for message in messages if isinstance(message, Pose)]
+    if believed is None:
+        return PoseFound(state.reason or Reason.IMPLAUSIBLE_POSE, passes=passes, stage_ms=stage_ms)
+    pose = next(pose for pose in reversed(poses) if np.array_equal(pose.cam_from_object, believed))
     return PoseFound(
-        reason=Reason.OK,
-        cam_from_object=refined.cam_from_object,
-        covariance=solved.covariance if refined.covariance is None else refined.covariance,
-        inliers=len(solved.inliers_in_frame),
-        correspondences=solved.correspondences,
-        residual_px=solved.residual_px,
-        refined=refined.refined,
-        loss_before=refined.loss_before,
-        loss_after=refined.loss_after,
-        stage_ms=ms,
-    )
+        None, believed, state.covariance, state.score, state.state, pose.inliers, pose.correspondences,
+        pose.residual_px, pose.refined, pose.loss_before, pose.loss_after, passes, stage_ms,
+    )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fieldpose.bus.errors import FieldposeError
+from fieldpose.errors import FieldposeError
 
 _FOLDER = Path(__file__).resolve().parent.parent / "recordings" / "demo"
 

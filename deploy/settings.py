@@ -17,10 +17,11 @@ from typing import Any, TypeVar, get_type_hints
 import msgspec
 
 from fieldpose.bus.topics import Address
+from fieldpose.errors import ConfigError
 from fieldpose.stages.camera.config import CameraConfig
-from fieldpose.stages.errors import ConfigError
 from fieldpose.stages.lifting.config import LiftingConfig
 from fieldpose.stages.matching.core import MatchingConfig
+from fieldpose.stages.nerf.config import Backend
 from fieldpose.stages.pnp.config import PnpConfig
 from fieldpose.stages.refinement.config import RefinementConfig
 from fieldpose.stages.rendering.config import RenderingConfig
@@ -29,13 +30,14 @@ from fieldpose.stages.tracking.config import TrackingConfig
 
 T = TypeVar("T")
 
-VIDEO_VIEW_SIZE = 256
-
 
 @dataclass(frozen=True)
 class Settings:
     """Every stage's settings; each is described where it is defined."""
 
+    backend: Backend = "auto"
+    """What the field is rendered by: compiled kernels on the CPU (numba), torch on a CUDA device (cuda; auto: where
+    there is one), or torch on the CPU (torch, slow)."""
     address: Address = field(default_factory=Address)
     camera: CameraConfig = field(default_factory=lambda: CameraConfig(source=""))
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
@@ -50,16 +52,6 @@ class Settings:
 def read_settings(path: Path | None) -> Settings:
     """The defaults, changed by a file where one is given. Raises ConfigError that names the file and the key."""
     return Settings() if path is None else changed(Settings(), read_file(path), str(path))
-
-
-def for_video(settings: Settings) -> Settings:
-    """The settings with what videos need in place of what was left open."""
-    rendering, refinement = settings.rendering, settings.refinement
-    if rendering.size == 0:
-        rendering = dataclasses.replace(rendering, size=VIDEO_VIEW_SIZE)
-    if refinement.when == "auto":
-        refinement = dataclasses.replace(refinement, when="never")
-    return dataclasses.replace(settings, rendering=rendering, refinement=refinement)
 
 
 def read_file(path: Path) -> dict[str, Any]:

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields
+from collections import OrderedDict
 
 import cv2
 import numpy as np
 
-from fieldpose.bus.messages import CameraModel, Frame, Header
-from fieldpose.stages.geometry import Camera
+from fieldpose.bus.messages import Frame
 
-NO_CAMERA = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0)
-"""Stands for the camera in the messages of failures, where none is known."""
+_KEPT_IMAGES = 4
 
 
-def camera_of(model: CameraModel) -> Camera:
-    """The camera of a message."""
-    return Camera(**{field.name: getattr(model, field.name) for field in fields(Camera)})
+class FrameImages:
+    """The images of the last frames, each decoded once, whoever of this process looks at it."""
 
+    def __init__(self) -> None:
+        self._images: OrderedDict[tuple[int, int], np.ndarray | None] = OrderedDict()
 
-def camera_model(camera: Camera) -> CameraModel:
-    """A camera for a message."""
-    return CameraModel(**asdict(camera))
+    def of(self, frame: Frame) -> np.ndarray | None:
+        """(h, w, 3) uint8 RGB; None where its bytes are no image of the frame's size."""
+        key = (frame.header.frame_id, frame.header.capture_ns)
+        if key not in self._images:
+            self._images[key] = frame_image(frame)
+            while len(self._images) > _KEPT_IMAGES:
+                self._images.popitem(last=False)
+        return self._images[key]
 
 
 def frame_image(frame: Frame) -> np.ndarray | None:
@@ -35,8 +39,3 @@ def frame_image(frame: Frame) -> np.ndarray | None:
     if bgr is None or bgr.shape[:2] != (frame.camera.height, frame.camera.width):
         return None
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
-
-
-def frame_rng(header: Header) -> np.random.Generator:
-    """Random numbers that a frame and pass have again when a recording is replayed."""
-    return np.random.default_rng((header.frame_id, header.pass_index))

@@ -12,13 +12,13 @@ from typing import Annotated
 import tyro
 from rich.progress import Progress
 
-from fieldpose.deploy.commands.run import INTERRUPTED, give_out
-from fieldpose.deploy.processes.pipeline import Plan, run_pipeline
+from fieldpose.deploy.commands.run import INTERRUPTED, give_out, planned
+from fieldpose.deploy.processes.pipeline import Run, run_pipeline
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_bytes, write_json
 from fieldpose.deploy.reporting.report import live_line
 from fieldpose.deploy.reporting.results import RunResult
 from fieldpose.deploy.scene import demo_file
-from fieldpose.deploy.settings import Settings, for_video
+from fieldpose.deploy.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,9 @@ class Options:
         recording = self.out / "recording.mcap"
         check_writable(recording, self.json)
         camera = replace(self.settings.camera, source=f"mcap:{sequence}")
-        plan = Plan(field, for_video(replace(self.settings, camera=camera)), recording, logs=self.logs)
+        plan = planned(replace(self.settings, camera=camera), field)
         with live_line("demo") as report:
-            outcome = run_pipeline(plan, report)
+            outcome = run_pipeline(Run(plan, recording, logs=self.logs), report)
         summary = give_out(outcome, "demo", self.out / "summary.json")
         write_json(self.json, summary)
         if outcome.interrupted:

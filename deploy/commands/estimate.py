@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,13 +12,15 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from fieldpose.deploy.errors import UsageError
+from fieldpose.bus.messages import CameraOrigin, TrackingState
+from fieldpose.deploy.commands.run import planned
 from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
 from fieldpose.deploy.settings import Settings
+from fieldpose.errors import UsageError
+from fieldpose.stages.camera.calibration import Calibration, Calibrator
+from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.geometry import Camera
-from fieldpose.stages.nerf.metadata import FieldMetadata
-
-_ASPECT_TOLERANCE = 0.01
+from fieldpose.stages.tracking.scoring import deviations
 
 
 @dataclass(frozen=True)
@@ -30,9 +33,10 @@ class Options:
     that is believed, training views are tried: those that look like the image, then those nearest to the guess
     (--tracking.searches). Exits with 1 where no pose is found.
 
-    The JSON file has: ok, reason, cam_from_object (4x4 by rows, OpenCV axes), covariance (6x6 of the left twist:
-    translation, rotation), inliers, correspondences, residual_px, refined, loss_before, loss_after, passes, camera,
-    seconds, stage_ms.
+    It is found as `fieldpose run` finds that of a photo in a folder. The JSON file has: ok, reason, cam_from_object
+    (4x4 by rows, OpenCV axes), covariance (6x6 of the left twist: translation, rotation), score, state (limited: found
+    with a camera that was assumed), inliers, correspondences, residual_px, refined, loss_before, loss_after, passes,
+    camera, camera_origin (calibrated, training, exif or assumed), seconds, stage_ms.
     """
 
     field: tyro.conf.Positional[Path]
@@ -55,63 +59,55 @@ class Options:
     def run(self) -> int:
         """Estimate, print the pose."""
         from fieldpose.deploy.local import PoseFinder
-        from fieldpose.stages.nerf.field import load_field
-        from fieldpose.stages.nerf.loading import make_renderer
-        from fieldpose.stages.tracking.guesses import start_pose
-        from fieldpose.stages.tracking.views import training_views
+        from fieldpose.deploy.parts import Parts
 
         check_writable(self.json, self.overlay)
-        field = load_field(self.field)
-        image, camera = self._image(field.metadata)
-        views = training_views(field)
-        guess = None if self.guess is None else start_pose(self.guess, views)
-        if guess is None and views.descriptors is None:
-            raise UsageError(
-                f"{self.field}: this field does not know how its training views look; give --guess, or train it again"
-            )
-        if guess is None and self.settings.retrieval.candidates == 0:
-            raise UsageError("--retrieval.candidates 0 leaves no pose to begin with; give --guess")
-        renderer = make_renderer(field, threads=0)
-        finder = PoseFinder(renderer, self.settings, views)
+        plan = planned(self._settings(), self.field)
+        parts = Parts(plan, together=True)
+        image, calibration = self._image(parts.known_cameras(), plan.settings.camera)
+        finder = PoseFinder(parts)
         began = time.perf_counter()
-        found = finder.find(image, camera, guess)
+        found = finder.find(image, calibration.camera, origin=calibration.origin)
         seconds = time.perf_counter() - began
         values = {name: getattr(found, name) for name in ("ok", *(f.name for f in dataclasses.fields(found)))}
-        result = {**values, "camera": camera, "seconds": seconds}
-        write_json(self.json, {name: _plain(value) for name, value in result.items()})
+        told = {"camera": calibration.camera, "camera_origin": calibration.origin, "seconds": seconds}
+        write_json(self.json, {name: _plain(value) for name, value in (values | told).items()})
+        if calibration.origin in (CameraOrigin.EXIF, CameraOrigin.ASSUMED):
+            print(f"camera: {calibration.told}")
         if found.cam_from_object is None:
             print(f"no pose: {found.reason} after {seconds:.2f} s")
             return 1
-        print(f"cam_from_object (OpenCV axes, {field.metadata.unit}):\n{np.round(found.cam_from_object, 6)}")
+        print(f"cam_from_object (OpenCV axes, {parts.field.metadata.unit}):\n{np.round(found.cam_from_object, 6)}")
         quality = f"{found.inliers} of {found.correspondences} points agree, {found.residual_px:.2f} px"
         print(f"{quality}, {found.passes} passes, {seconds:.2f} s{', refined' if found.refined else ''}")
+        if found.covariance is not None:
+            sigma, sigma_deg = deviations(found.covariance)
+            unsure = ": by an assumed camera, so do not rely on it" if found.state is TrackingState.LIMITED else ""
+            print(f"standard deviations {sigma:.3g} and {sigma_deg:.3g} degrees{unsure}")
         if self.overlay is not None:
             from fieldpose.deploy.reporting.overlay import encoded, overlaid
 
-            picture = overlaid(image, renderer.render_view(camera.undistorted(), found.cam_from_object))
-            write_bytes(self.overlay, encoded(picture, self.overlay))
+            view = parts.renderer.render_view(calibration.camera.undistorted(), found.cam_from_object)
+            write_bytes(self.overlay, encoded(overlaid(image, view), self.overlay))
         return 0
 
-    def _image(self, metadata: FieldMetadata) -> tuple[np.ndarray, Camera]:
+    def _settings(self) -> Settings:
+        """The settings with the short flags applied, for a photo."""
+        s = self.settings
+        camera_file, guess = self.camera_file or s.camera.camera_file, self.guess or s.tracking.guess
+        if guess is not None and guess.startswith("perturb:"):
+            raise UsageError(f"--guess {guess}: of one image no true pose is known; give train:NAME or a file")
+        tracking = replace(s.tracking, guess=guess, sequence="photos")
+        return replace(s, camera=replace(s.camera, camera_file=camera_file), tracking=tracking)
+
+    def _image(self, known: Sequence[Camera], config: CameraConfig) -> tuple[np.ndarray, Calibration]:
         """The pixels (h, w, 3) uint8 and the camera. Raises DatasetError and SourceError."""
-        from fieldpose.stages.camera.calibration import calibrate
         from fieldpose.stages.nerf.datasets.images import load_pixels, over_background, probe
 
         header = probe(self.image)
         width, height = header.width, header.height
         image = over_background(load_pixels(self.image, width, height, header.has_alpha), "white")
-        given = self.camera_file or self.settings.camera.camera_file
-        config = replace(self.settings.camera, camera_file=given)
-        trained = _training_camera(metadata, width, height) if given is None else None
-        return image, trained or calibrate(config, width, height, self.image).camera
-
-
-def _training_camera(metadata: FieldMetadata, width: int, height: int) -> Camera | None:
-    """The first training view's camera at that size, None where the shape is another."""
-    for view in metadata.cameras[:1]:
-        if abs(view.width * height - view.height * width) <= _ASPECT_TOLERANCE * view.width * height:
-            return view.camera.resized(width, height)
-    return None
+        return image, Calibrator(config, known).of(width, height, self.image)
 
 
 def _plain(value: Any) -> Any:

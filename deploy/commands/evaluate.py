@@ -13,9 +13,9 @@ import numpy as np
 import tyro
 from rich.table import Table
 
-from fieldpose.deploy.errors import UsageError
 from fieldpose.deploy.reporting.output import check_writable, result_console, write_json
 from fieldpose.deploy.settings import Settings
+from fieldpose.errors import UsageError
 
 if TYPE_CHECKING:
     from fieldpose.deploy.evaluation.occlusion import DrawThing
@@ -92,7 +92,7 @@ class Options:
         from fieldpose.stages.nerf.datasets import load_dataset
         from fieldpose.stages.nerf.field import load_field
         from fieldpose.stages.nerf.loading import make_renderer, warm_up
-        from fieldpose.stages.tracking.views import training_views
+        from fieldpose.stages.nerf.training_views import training_views
 
         check_writable(self.json, self.plot)
         self._check()

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from fieldpose.bus.replay import RECORDING_RECORD, RecordingInfo, info
 from fieldpose.deploy.reporting.output import result_console, write_json
-from fieldpose.deploy.reporting.provenance import RUN_RECORD
+from fieldpose.deploy.reporting.provenance import PLAN_RECORD, RUN_RECORD
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,7 @@ def _description(recording: RecordingInfo) -> Iterator[str]:
     yield "no message lost" if recording.lossless else f"NOT LOSSLESS{_why(recording)}"
     run = recording.metadata.get(RUN_RECORD, {})
     yield from (f"  {name}: {value}" for name, value in run.items())
+    yield from (f"  planned: {name}: {value}" for name, value in recording.metadata.get(PLAN_RECORD, {}).items())
     yield from (f"  attached: {name} ({count} bytes)" for name, count in recording.attachments.items())
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from fieldpose.bus.errors import RecordingError
 from fieldpose.bus.recording import partial_path, recover
+from fieldpose.errors import RecordingError
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ import tyro
 from fieldpose.bus.messages import State
 from fieldpose.bus.replay import RecordingInfo, info, read_recording
 from fieldpose.bus.topics import STATE
-from fieldpose.deploy.commands.run import INTERRUPTED
-from fieldpose.deploy.processes.pipeline import Plan, run_pipeline
+from fieldpose.deploy.commands.run import INTERRUPTED, planned
+from fieldpose.deploy.processes.pipeline import Run, run_pipeline
 from fieldpose.deploy.reporting.output import check_writable, result_console, write_json
 from fieldpose.deploy.reporting.provenance import recorded_field, recorded_settings
 from fieldpose.deploy.reporting.report import live_line, print_summary
@@ -55,7 +55,7 @@ class Options:
         recorded = info(self.recording)
         with tempfile.TemporaryDirectory(prefix="fieldpose-") as folder, live_line("replay") as report:
             field = self.field or recorded_field(self.recording, recorded, Path(folder))
-            outcome = run_pipeline(Plan(field, self._settings(), self.record), report)
+            outcome = run_pipeline(Run(planned(self._settings(), field), self.record), report)
         summary = summarise(outcome)
         comparison = compare(recorded_poses(self.recording), outcome.frames)
         print_summary(summary, f"replay of {self.recording}")

@@ -9,15 +9,16 @@ from typing import Annotated, Literal, TypeVar
 
 import tyro
 
-from fieldpose.deploy.errors import UsageError
-from fieldpose.deploy.processes.pipeline import Plan, run_pipeline
+from fieldpose.deploy.plan import Plan, resolve
+from fieldpose.deploy.processes.pipeline import Run, run_pipeline
 from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
-from fieldpose.deploy.reporting.report import live_line, print_summary
+from fieldpose.deploy.reporting.report import live_line, print_plan, print_summary
 from fieldpose.deploy.reporting.results import RunResult, summarise, to_csv
-from fieldpose.deploy.settings import Settings, for_video
+from fieldpose.deploy.settings import Settings
+from fieldpose.errors import UsageError
 from fieldpose.stages.camera.config import Pace
-from fieldpose.stages.camera.sources import is_video
 from fieldpose.stages.nerf.field import load_field
+from fieldpose.stages.nerf.training_views import training_views
 
 INTERRUPTED = 130
 
@@ -53,8 +54,11 @@ class Options:
     pace: Pace | None = None
     """live: by the source's own times; lockstep: a frame when the one before is answered; fast: at once (short
     for --camera.pace)."""
-    sequence: Literal["auto", "video", "photos"] = "auto"
-    """Whether motion between frames may be relied upon; auto: in videos, recordings and from cameras."""
+    sequence: Literal["auto", "video", "photos"] | None = None
+    """Photos stand each by itself, in videos the motion carries on; auto: in videos, recordings and from cameras (short
+    for --tracking.sequence)."""
+    dry_run: bool = False
+    """Print what would be run, with everything that was left open decided, and run nothing."""
     passes: int | None = None
     """Most passes over a frame (short for --tracking.passes)."""
     depth: int | None = None
@@ -73,13 +77,15 @@ class Options:
 
     def run(self) -> int:
         """Run, print the figures, write what was asked for."""
-        load_field(self.field)
-        settings = self.with_shortcuts()
+        plan = planned(self.with_shortcuts(), self.field)
+        source = plan.settings.camera.source
+        if self.dry_run:
+            print_plan(plan)
+            return 0
         check_writable(self.record, self.json, self.csv)
-        plan = Plan(self.field, settings, self.record, self.listen, self.logs)
-        with live_line(settings.camera.source) as report:
-            outcome = run_pipeline(plan, report)
-        give_out(outcome, settings.camera.source, self.json, self.csv)
+        with live_line(source) as report:
+            outcome = run_pipeline(Run(plan, self.record, self.listen, self.logs), report)
+        give_out(outcome, source, self.json, self.csv)
         return INTERRUPTED if outcome.interrupted else 0
 
     def with_shortcuts(self) -> Settings:
@@ -88,14 +94,18 @@ class Options:
         camera = _with(s.camera, source=self.source, size=self.size, pace=self.pace)
         if not camera.source:
             raise UsageError("no source of images; give --source, for instance --source folder:DIR")
-        tracking = _with(s.tracking, guess=self.guess, passes=self.passes, depth=self.depth)
-        video = is_video(camera.source)
-        if self.sequence != "auto" or not video:
-            tracking = replace(tracking, sequence="photos" if self.sequence == "auto" else self.sequence)
-        refinement = _with(s.refinement, when=self.refine)
-        matching = _with(s.matching, matcher=self.matcher)
-        settings = replace(s, camera=camera, tracking=tracking, matching=matching, refinement=refinement)
-        return for_video(settings) if tracking.sequence == "video" else settings
+        return _with(
+            s,
+            camera=camera,
+            tracking=_with(s.tracking, guess=self.guess, passes=self.passes, depth=self.depth, sequence=self.sequence),
+            matching=_with(s.matching, matcher=self.matcher),
+            refinement=_with(s.refinement, when=self.refine),
+        )
+
+
+def planned(settings: Settings, field: Path) -> Plan:
+    """The plan of a run with a field's file. Raises FieldFileError, ConfigError, SourceError and DatasetError."""
+    return resolve(settings, training_views(load_field(field)), field)
 
 
 def give_out(outcome: RunResult, title: str, json: Path | None, csv: Path | None = None) -> dict[str, object]:

@@ -8,20 +8,30 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.node import Handler, run_node
 from fieldpose.bus.transport import LOCAL_HUB, ZenohBus, log_to_stderr, serve_hub, wait_for
-from fieldpose.deploy.graph import CAMERA, TABLE, Launch, ProcessSpec, thread_environment, threads_of
+from fieldpose.deploy.graph import BY_NAME, CAMERA, GRAPH, Launch, Process, thread_environment, threads_of
+from fieldpose.deploy.parts import Parts
+from fieldpose.deploy.plan import Plan, resolve
 from fieldpose.deploy.processes.endpoints import peer_address
 from fieldpose.deploy.processes.lifeline import die_with_parent
 from fieldpose.deploy.processes.warmup import compile_kernels
 from fieldpose.deploy.settings import Settings
 
+if TYPE_CHECKING:
+    from fieldpose.stages.nerf.training_views import TrainingViews
+
 _START_S = 300.0
 """Others may be compiling their kernels."""
+
+
+_Name = Annotated[str, tyro.conf.arg(constructor=tyro.extras.literal_type_from_choices(list(BY_NAME)))]
+_WITH_FIELD = ", ".join(row.name for row in GRAPH if row.needs_field)
 
 
 @dataclass(frozen=True)
@@ -31,20 +41,16 @@ class Options:
     Example: fieldpose stage matching --connect tcp/10.0.0.2:7447 --matching.matcher sift
     """
 
-    name: tyro.conf.Positional[
-        Literal[
-            "hub", "recorder", "camera", "tracking", "retrieval", "rendering", "matching", "lifting", "pnp",
-            "refinement",
-        ]
-    ]  # fmt: skip
+    name: tyro.conf.Positional[_Name]
     """Which process."""
     connect: str = LOCAL_HUB
     """Where the hub is."""
     listen: str | None = None
     """Where this process listens: the hub for everybody (default: the address of --connect), any other for the
     processes that it exchanges messages with (default: any port, for this machine alone if the hub is on it)."""
-    field: Path | None = None
-    """The field, for the processes that need it: tracking, retrieval, rendering, lifting, refinement."""
+    field: Annotated[Path | None, tyro.conf.arg(help=f"The field, for the processes that need it: {_WITH_FIELD}.")] = (
+        None
+    )
     record: Path | None = None
     """The recorder's file (.mcap)."""
     threads: int | None = None
@@ -61,11 +67,11 @@ class Options:
         if supervised:
             die_with_parent()
         log_to_stderr()
-        make_handler = TABLE[self.name].handler
-        if make_handler is None:
+        row = BY_NAME[self.name]
+        if row.make is None:
             serve_hub(self.listen or self.connect)
         else:
-            _serve(self, TABLE[self.name], make_handler)
+            _serve(self, row, row.make)
         if supervised:
             # Everything is closed, and Python would take two seconds to take the numeric libraries apart.
             sys.stderr.flush()
@@ -73,23 +79,39 @@ class Options:
         return 0
 
 
-def _serve(options: Options, spec: ProcessSpec, make_handler: Callable[[Launch], Handler]) -> None:
-    threads = options.threads or threads_of(spec, options.settings.tracking.depth)
+def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handler]) -> None:
+    settings = options.settings
+    threads = options.threads or threads_of(row, settings.tracking.depth)
     os.environ.update(thread_environment(threads))
-    address = options.settings.address
-    if options.field is not None and spec.renders:
-        compile_kernels(options.field, spec.name)
+    parts = Parts(resolve(settings, _views(options.field), options.field), threads)
+    _tell(parts.plan, row)
+    if options.field is not None and row.renders:
+        compile_kernels(options.field, row.name)
+    address = settings.address
     bus = ZenohBus(options.connect, options.listen or peer_address(options.connect))
 
     def wait_until_ready() -> None:
         wait_for(bus, address, options.wait_for, _START_S)
 
     try:
-        launch = Launch(bus, options.settings, threads, options.field, options.record, wait_until_ready)
-        handler = make_handler(launch)
+        handler = make(parts, Launch(bus, options.record, wait_until_ready))
         bus.wait_for_hub(_START_S)
-        if spec.name != CAMERA:
+        if row.name != CAMERA:
             wait_until_ready()
         run_node(handler, bus, address)
     finally:
         bus.close()
+
+
+def _views(field: Path | None) -> TrainingViews | None:
+    if field is None:
+        return None
+    from fieldpose.stages.nerf.field import load_field
+    from fieldpose.stages.nerf.training_views import training_views
+
+    return training_views(load_field(field))
+
+
+def _tell(plan: Plan, row: Process) -> None:
+    """Say what was decided on this host, which must be what others decide: they need the same settings."""
+    stage_logger(row.name).info("plan", **{name.replace(" ", "_"): what for name, what in plan.notes.items()})

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
 from fieldpose.deploy.settings import Settings
-from fieldpose.stages.errors import WeightsError
+from fieldpose.errors import WeightsError
 from fieldpose.stages.matching.core import MatchingConfig
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 
@@ -101,7 +101,7 @@ class Options:
         """How well its own training images are found in it; None, said on stderr, where the weights are missing."""
         from fieldpose.deploy.evaluation.accuracy import pose_accuracy
         from fieldpose.stages.nerf.loading import make_renderer
-        from fieldpose.stages.tracking.views import training_views
+        from fieldpose.stages.nerf.training_views import training_views
 
         renderer = make_renderer(field, self.training.threads)
         try:

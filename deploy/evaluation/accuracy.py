@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from fieldpose.deploy.local import PoseFinder
+from fieldpose.deploy.local import photo_finder
 from fieldpose.deploy.settings import Settings
 from fieldpose.stages.geometry import Camera, mahalanobis_squared, rotation_error_deg, translation_error
 from fieldpose.stages.nerf.metadata import PoseAccuracy
 from fieldpose.stages.nerf.rendering_api import RayRenderer
+from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.tracking.distance import Limit, pairwise
-from fieldpose.stages.tracking.views import TrainingViews
 
 _IMAGES = 32
 _ENOUGH = 8
@@ -42,12 +42,11 @@ def pose_accuracy(
         return None
     settings = replace(
         settings,
-        rendering=replace(settings.rendering, reuse_angle_deg=0.0),
         refinement=replace(settings.refinement, when="never"),
         tracking=replace(settings.tracking, searches=0),
     )
     # What is believed of a pose is to be found out here, not taken from what was found out before.
-    finder = PoseFinder(renderer, settings, replace(views, error_scale=1.0))
+    finder = photo_finder(settings, replace(views, error_scale=1.0), renderer)
     neighbours = _neighbours(views, Limit(settings.tracking.cover_deg, settings.tracking.cover * views.scale))
     chosen = np.unique(np.linspace(0, len(images) - 1, _IMAGES).astype(int))
     turns, shifts, distances = [], [], []

@@ -10,11 +10,11 @@ import numpy as np
 
 from fieldpose.bus.messages import Reason
 from fieldpose.deploy.evaluation.baselines import BASELINES
-from fieldpose.deploy.local import PoseFinder, PoseFound
+from fieldpose.deploy.local import PoseFinder, PoseFound, photo_finder
 from fieldpose.deploy.settings import Settings
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.nerf.rendering_api import RayRenderer
-from fieldpose.stages.tracking.views import TrainingViews
+from fieldpose.stages.nerf.training_views import TrainingViews
 
 
 class Finder(Protocol):
@@ -63,14 +63,12 @@ class _Baseline:
 
     def find(self, image: np.ndarray, camera: Camera, guess: np.ndarray) -> PoseFound:
         pose = self._method.find(image, camera, guess)
-        return PoseFound(Reason.NO_CONSENSUS) if pose is None else PoseFound(Reason.OK, pose)
+        return PoseFound(Reason.NO_CONSENSUS) if pose is None else PoseFound(None, pose)
 
 
 def _ours(change: Callable[[Settings], Settings], ablates: str | None = None) -> Method:
     def make(renderer: RayRenderer, settings: Settings, views: TrainingViews) -> Finder:
-        # Guesses are independent of each other: no view rendered for one may serve the next.
-        alone = replace(settings, rendering=replace(settings.rendering, reuse_angle_deg=0.0))
-        return PoseFinder(renderer, change(alone), views)
+        return photo_finder(change(settings), views, renderer)
 
     return Method(make, ablates=ablates)
 
@@ -80,7 +78,7 @@ def _retrieved(change: Callable[[Settings], Settings]) -> Method:
         rendering = replace(settings.rendering, cache_mb=_PREPARED_MB)
         matching = replace(settings.matching, kept_views=len(views.names))
         prepared = replace(settings, rendering=rendering, matching=matching)
-        return _FromLookalike(PoseFinder(renderer, change(prepared), views))
+        return _FromLookalike(photo_finder(change(prepared), views, renderer))
 
     return Method(make, recalls=True)
 

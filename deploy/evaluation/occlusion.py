@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets import Dataset
 
 DrawThing = Callable[[np.random.Generator], np.ndarray]

@@ -19,7 +19,7 @@ from fieldpose.deploy.settings import Settings
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.nerf.datasets import Dataset
 from fieldpose.stages.nerf.rendering_api import RayRenderer
-from fieldpose.stages.tracking.views import TrainingViews
+from fieldpose.stages.nerf.training_views import TrainingViews
 
 
 @dataclass(frozen=True)

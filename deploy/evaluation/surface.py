@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 from scipy.spatial.distance import pdist
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry import points_at_depth
 from fieldpose.stages.nerf.metadata import TrainingCamera
 from fieldpose.stages.nerf.rendering_api import RayRenderer

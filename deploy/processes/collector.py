@@ -6,20 +6,21 @@ from collections import Counter, OrderedDict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 
-from fieldpose.bus import topics
 from fieldpose.bus.codec import decode_header
-from fieldpose.bus.errors import CodecError
-from fieldpose.bus.messages import Header, Message, Pose, State, Stats, Truth
+from fieldpose.bus.messages import Header, Message, Reason, State, Stats, Truth
 from fieldpose.bus.ports import Inbox, Sequences
 from fieldpose.bus.protocol import Bus
-from fieldpose.bus.topics import FRAME, GUESS, POSE, STATE, STATS, TRUTH, Address, Topic
-from fieldpose.deploy.reporting.results import STAGE_OF, FrameResult, Outcome, TruthKnown
+from fieldpose.bus.topics import FRAME, GUESS, STATE, STATS, TRUTH, Address, Topic
+from fieldpose.deploy.graph import BETWEEN_STAGES
+from fieldpose.deploy.reporting.results import FrameResult, Outcome, TruthKnown
+from fieldpose.errors import CodecError
 
-_TIMED = (FRAME, GUESS, topics.VIEW, topics.MATCHES, topics.CORRESPONDENCES, topics.ESTIMATE)
-_READ = (POSE, STATE, TRUTH, STATS)
+_TIMED = (FRAME, *BETWEEN_STAGES)
+_READ = (STATE, TRUTH, STATS)
 _CAPACITY = 4096
 _FRAMES_KEPT = 100_000
 _RATE_WINDOW_NS = 3_000_000_000
@@ -27,11 +28,12 @@ _RATE_WINDOW_NS = 3_000_000_000
 
 @dataclass
 class _Seen:
-    """Everything about one frame; `sent_ns` by pass and topic."""
+    """Everything about one frame; `sent`: when each process has sent something of it; `passes`: its guesses."""
 
     capture_ns: int
     camera_sent_ns: int | None = None
-    sent_ns: dict[int, dict[str, int]] = field(default_factory=dict)
+    sent: list[tuple[int, str]] = field(default_factory=list)
+    passes: int = 0
     state: State | None = None
     truth: Truth | None = None
 
@@ -49,7 +51,7 @@ class Collector:
         self.sent = 0
         self._numbers = Sequences(from_start=True)
         self._frames: OrderedDict[int, _Seen] = OrderedDict()
-        self._headers: deque[tuple[Topic, Header]] = deque()
+        self._headers: deque[tuple[Topic[Any], Header]] = deque()
         self._reported_ns: deque[int] = deque()
         self._inbox = Inbox(bus, address, _READ, dict.fromkeys(_READ, _CAPACITY))
         self._subscriptions = [
@@ -67,7 +69,7 @@ class Collector:
             self._note_header(*self._headers.popleft())
         for received in self._inbox.drain():
             self.observed[received.key] += 1
-            self._note(received.topic, received.message)
+            self._note(received.message)
 
     def results(self) -> list[FrameResult]:
         """What became of each frame that the camera has sent, oldest first."""
@@ -79,7 +81,7 @@ class Collector:
             self._reported_ns.popleft()
         return len(self._reported_ns) / (_RATE_WINDOW_NS / 1e9)
 
-    def _timed(self, topic: Topic, key: str, payload: bytes, received_ns: int) -> None:
+    def _timed(self, topic: Topic[Any], key: str, payload: bytes, received_ns: int) -> None:
         try:
             header = decode_header(payload)
         except CodecError:
@@ -90,14 +92,15 @@ class Collector:
             self.sent += 1 + self._numbers.seen(key, header)
         self._headers.append((topic, header))
 
-    def _note_header(self, topic: Topic, header: Header) -> None:
+    def _note_header(self, topic: Topic[Any], header: Header) -> None:
         seen = self._seen(header)
         if topic is FRAME:
             seen.camera_sent_ns = header.sent_ns
         else:
-            seen.sent_ns.setdefault(header.pass_index, {})[topic.name] = header.sent_ns
+            seen.sent.append((header.sent_ns, header.source))
+            seen.passes += topic is GUESS
 
-    def _note(self, topic: Topic, message: Message) -> None:
+    def _note(self, message: Message) -> None:
         match message:
             case Stats():
                 self.stats[message.stage] = message
@@ -106,8 +109,6 @@ class Collector:
                 self._reported_ns.append(message.header.sent_ns)
             case Truth():
                 self._seen(message.header).truth = message
-            case Pose():
-                self._note_header(topic, message.header)
 
     def _seen(self, header: Header) -> _Seen:
         seen = self._frames.get(header.frame_id)
@@ -120,42 +121,43 @@ class Collector:
 
 def _result(frame_id: int, seen: _Seen) -> FrameResult:
     state = seen.state
-    last = state.header.pass_index if state is not None else max(seen.sent_ns, default=0)
-    answered_ns = seen.sent_ns.get(last, {}).get(POSE.name)
     # A score of 0 is no measurement, whatever pose tracking carries on with.
-    found = state.cam_from_object if state is not None and state.score > 0 and answered_ns else None
+    found = state.cam_from_object if state is not None and state.score > 0 else None
     return FrameResult(
         frame_id=frame_id,
         capture_ns=seen.capture_ns,
-        outcome=_outcome(seen, answered_ns),
-        passes=len(seen.sent_ns),
+        outcome=_outcome(seen),
+        passes=seen.passes,
         state=str(state.state) if state is not None else None,
         score=state.score if state is not None else 0.0,
+        reason=str(state.reason) if state is not None and state.reason is not None else None,
+        camera_origin=str(state.camera_origin) if state is not None else None,
         cam_from_object=_copied(found),
         covariance=None if found is None or state is None else _copied(state.covariance),
         truth=None if seen.truth is None else TruthKnown(_copied(seen.truth.cam_from_object)),
         sent_ns=seen.camera_sent_ns,
-        answered_ns=answered_ns,
+        answered_ns=None if state is None else state.header.sent_ns,
         stage_ms=dict(_stage_ms(seen)),
     )
 
 
-def _outcome(seen: _Seen, answered_ns: int | None) -> Outcome:
-    if not any(GUESS.name in sent for sent in seen.sent_ns.values()):
+def _outcome(seen: _Seen) -> Outcome:
+    if not seen.sent:
         return "dropped"
-    return "finished" if seen.state is not None and answered_ns is not None else "lost"
+    return "lost" if seen.state is None or seen.state.reason is Reason.NO_ANSWER else "finished"
 
 
 def _stage_ms(seen: _Seen) -> Iterator[tuple[str, float]]:
-    """How long a stage took for the frame, all passes together: from the sending of its input to its own."""
+    """How long each process took for the frame, all passes together: from what was sent before to its own sending."""
+    sent = list(seen.sent)
+    if seen.state is not None:
+        sent.append((seen.state.header.sent_ns, seen.state.header.source))
     total: dict[str, float] = {}
     before = seen.camera_sent_ns
-    for _, sent in sorted(seen.sent_ns.items()):
-        for topic in STAGE_OF:
-            now = sent.get(topic)
-            if before is not None and now is not None:
-                total[STAGE_OF[topic]] = total.get(STAGE_OF[topic], 0.0) + (now - before) / 1e6
-            before = now
+    for now, source in sorted(sent):
+        if before is not None:
+            total[source] = total.get(source, 0.0) + (now - before) / 1e6
+        before = now
     yield from total.items()
 
 

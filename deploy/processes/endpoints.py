@@ -7,7 +7,7 @@ import ipaddress
 import re
 import socket
 
-from fieldpose.bus.errors import TransportError
+from fieldpose.errors import TransportError
 
 _TCP = re.compile(r"(?:tcp|tls|ws|wss)/(?P<host>[\w.:\[\]-]+):(?P<port>\d+)")
 _THIS_MACHINE = "tcp/127.0.0.1:0"

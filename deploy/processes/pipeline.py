@@ -12,19 +12,29 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from fieldpose.bus.errors import RecordingError
 from fieldpose.bus.messages import State
 from fieldpose.bus.recording import partial_path
 from fieldpose.bus.replay import RecordingInfo, info
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.transport import ZenohBus
-from fieldpose.deploy.errors import ProcessError
-from fieldpose.deploy.graph import CAMERA, HUB, OBSERVER, RECORDER, STAGES, TABLE, thread_environment, threads_of
+from fieldpose.deploy.graph import (
+    BY_NAME,
+    CAMERA,
+    HUB,
+    OBSERVER,
+    RECORDER,
+    STAGES,
+    rows_of,
+    thread_environment,
+    threads_of,
+)  # fmt: skip
+from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.processes.collector import Collector
 from fieldpose.deploy.processes.endpoints import check_free, free_port, peer_address
 from fieldpose.deploy.processes.supervision import Program, Supervisor
 from fieldpose.deploy.reporting.results import RunResult
-from fieldpose.deploy.settings import Settings, to_json
+from fieldpose.deploy.settings import to_json
+from fieldpose.errors import ProcessError, RecordingError
 
 _START_S = 300.0
 _RESTARTS_AT_START, _RESTARTS = 2, 10
@@ -36,11 +46,10 @@ _RECORDER_FINISHES_S = 60.0
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What to run. `listen`: the hub's address (default: a free port of this machine); `logs`: a folder to keep."""
+class Run:
+    """A plan on this machine. `listen`: the hub's address (default: a free port); `logs`: a folder to keep."""
 
-    field: Path
-    settings: Settings
+    plan: Plan
     record: Path | None = None
     listen: str | None = None
     logs: Path | None = None
@@ -48,7 +57,7 @@ class Plan:
     @property
     def processes(self) -> list[str]:
         """The processes of this run, the hub among them."""
-        return [name for name in TABLE if name != RECORDER or self.record is not None]
+        return [row.name for row in rows_of(self.plan, self.record is not None)]
 
 
 @dataclass(frozen=True)
@@ -66,46 +75,48 @@ class Progress:
 Report = Callable[[Progress], None]
 
 
-def run_pipeline(plan: Plan, report: Report = lambda progress: None) -> RunResult:
+def run_pipeline(run: Run, report: Report = lambda progress: None) -> RunResult:
     """Run the source to its end, or until Ctrl-C or SIGTERM, and end every process.
 
     Raises ProcessError where a process cannot start or does not stay up, TransportError for a bad or used address,
     RecordingError for a recording that is in the way or could not be finished.
     """
-    _check_recording(plan.record)
-    check_free(plan.listen)
-    with StopSignals() as signals, _folder(plan.logs) as folder:
-        hub = plan.listen or f"tcp/127.0.0.1:{free_port()}"
-        with Supervisor(folder, programs(plan, folder, hub)) as supervisor:
-            return _Run(plan, supervisor, hub, signals, report).run()
+    _check_recording(run.record)
+    check_free(run.listen)
+    with StopSignals() as signals, _folder(run.logs) as folder:
+        hub = run.listen or f"tcp/127.0.0.1:{free_port()}"
+        with Supervisor(folder, programs(run, folder, hub)) as supervisor:
+            return _Running(run, supervisor, hub, signals, report).run()
 
 
-def programs(plan: Plan, folder: Path, hub: str) -> list[Program]:
+def programs(run: Run, folder: Path, hub: str) -> list[Program]:
     """The command line and environment of each process; their settings are left in `folder`."""
     progress_file = folder / "camera-progress.json"
     progress_file.unlink(missing_ok=True)
-    camera = replace(plan.settings.camera, progress_file=progress_file)
+    settings = run.plan.settings
     config = folder / "settings.json"
-    config.write_bytes(to_json(replace(plan.settings, camera=camera)))
-    listeners = (OBSERVER, RECORDER) if plan.record is not None else (OBSERVER,)
-    everyone = (*listeners, *(name for name in STAGES if name != CAMERA))
+    config.write_bytes(to_json(replace(settings, camera=replace(settings.camera, progress_file=progress_file))))
+    listeners = (OBSERVER, RECORDER) if run.record is not None else (OBSERVER,)
+    everyone = (*listeners, *(name for name in run.processes if name in STAGES and name != CAMERA))
     programs = []
-    for name in plan.processes:
-        spec = TABLE[name]
-        threads = threads_of(spec, plan.settings.tracking.depth)
+    for name in run.processes:
+        row = BY_NAME[name]
+        threads = threads_of(row, settings.tracking.depth)
         command = [sys.executable, "-P", "-m", "fieldpose", "stage", name, "--connect", hub, "--config", str(config)]
-        command += ["--field", str(plan.field.resolve()), "--threads", str(threads)]
-        if name == RECORDER and plan.record is not None:
-            command += ["--record", str(plan.record.resolve()), "--wait-for", OBSERVER]
+        if run.plan.field is not None:
+            command += ["--field", str(run.plan.field.resolve())]
+        command += ["--threads", str(threads)]
+        if name == RECORDER and run.record is not None:
+            command += ["--record", str(run.record.resolve()), "--wait-for", OBSERVER]
         elif name != HUB:
             command += ["--wait-for", *(everyone if name == CAMERA else listeners)]
-        programs.append(Program(name, command, thread_environment(threads), spec.stop_s, ends=name == CAMERA))
+        programs.append(Program(name, command, thread_environment(threads), row.stop_s, ends=name == CAMERA))
     return programs
 
 
-class _Run:
-    def __init__(self, plan: Plan, supervisor: Supervisor, hub: str, signals: StopSignals, report: Report) -> None:
-        self._plan = plan
+class _Running:
+    def __init__(self, run: Run, supervisor: Supervisor, hub: str, signals: StopSignals, report: Report) -> None:
+        self._of, self._plan = run, run.plan
         self._supervisor = supervisor
         self._hub = hub
         self._stop = signals.stop
@@ -131,7 +142,8 @@ class _Run:
             stats=collector.stats,
             observed=collector.observed,
             restarts=dict(self._supervisor.restarts),
-            recording=_recording(self._plan.record, self._supervisor),
+            plan=self._plan.notes,
+            recording=_recording(self._of.record, self._supervisor),
             interrupted=not finished,
             start_s=start_s,
         )
@@ -139,7 +151,7 @@ class _Run:
     def _start(self, bus: ZenohBus, collector: Collector) -> float:
         """Return when all processes are ready, or are to be stopped; returns when that was."""
         address = self._plan.settings.address
-        wanted = {address.live(name): name for name in self._plan.processes if name != HUB}
+        wanted = {address.live(name): name for name in self._of.processes if name != HUB}
         alive: set[str] = set()
         watching = bus.watch(address.live("*"), lambda key, up: (alive.add if up else alive.discard)(key))
         deadline = time.monotonic() + _START_S

@@ -18,8 +18,8 @@ from typing import Any
 
 from supervisor.xmlrpc import SupervisorTransport
 
-from fieldpose.deploy.errors import ProcessError
 from fieldpose.deploy.processes.lifeline import PARENT
+from fieldpose.errors import ProcessError
 
 USER_ERROR = 2
 """The exit code of a process that was given something that only the user can mend."""

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 from rich.console import Console
 
-from fieldpose.deploy.errors import OutputError
+from fieldpose.errors import OutputError
 
 _FILE_WIDTH = 140
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fieldpose.deploy.errors import OutputError
+from fieldpose.errors import OutputError
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.nerf.rendering_api import RenderedView
 

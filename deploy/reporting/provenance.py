@@ -10,19 +10,21 @@ from pathlib import Path
 
 import msgspec
 
-from fieldpose.bus.errors import RecordingError
 from fieldpose.bus.recording import Metadata
 from fieldpose.bus.replay import Attachment, RecordingInfo, read_attachment
+from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.settings import Settings, changed, to_json
+from fieldpose.errors import RecordingError
 
-RUN_RECORD = "fieldpose.run"
+RUN_RECORD, PLAN_RECORD = "fieldpose.run", "fieldpose.plan"
 SETTINGS_ATTACHMENT = "settings.json"
 FIELD_ATTACHMENT = "field.safetensors"
 _PACKAGES = ("fieldpose", "numpy", "torch", "kornia", "numba", "opencv-python-headless", "eclipse-zenoh")
 
 
-def metadata(settings: Settings, field: Path | None) -> Metadata:
-    """Names, seeds and versions, as text."""
+def metadata(plan: Plan) -> Metadata:
+    """Names, seeds and versions, as text, and what was decided for the run."""
+    settings, field = plan.settings, plan.field
     values = {
         "source": settings.camera.source,
         "seed": str(settings.tracking.seed),
@@ -32,14 +34,14 @@ def metadata(settings: Settings, field: Path | None) -> Metadata:
     }
     if field is not None:
         values |= {"field": str(field), "field_sha256": sha256_of(field)}
-    return {RUN_RECORD: values | {f"version {name}": _version(name) for name in _PACKAGES}}
+    return {RUN_RECORD: values | {f"version {name}": _version(name) for name in _PACKAGES}, PLAN_RECORD: plan.notes}
 
 
-def attachments(settings: Settings, field: Path | None) -> list[Attachment]:
-    """The settings with which a run can be repeated, and the field itself."""
-    items = [Attachment(SETTINGS_ATTACHMENT, "application/json", to_json(settings))]
-    if field is not None:
-        items.append(Attachment(FIELD_ATTACHMENT, "application/octet-stream", field.read_bytes()))
+def attachments(plan: Plan) -> list[Attachment]:
+    """The settings with which a run can be repeated, nothing in them left open, and the field itself."""
+    items = [Attachment(SETTINGS_ATTACHMENT, "application/json", to_json(plan.settings))]
+    if plan.field is not None:
+        items.append(Attachment(FIELD_ATTACHMENT, "application/octet-stream", plan.field.read_bytes()))
     return items
 
 

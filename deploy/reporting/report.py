@@ -8,10 +8,15 @@ from typing import Any
 
 from rich.table import Table
 
+from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.processes.pipeline import Progress
 from fieldpose.deploy.reporting.output import progress_console, result_console
 
 _MISSING = "-"
+_CAMERAS = {
+    "calibrated": "a calibration", "training": "the training views", "exif": "EXIF",
+    "assumed": "an ASSUMED field of view: no pose is sure; give --camera.camera-file",
+}  # fmt: skip
 
 
 @contextmanager
@@ -49,6 +54,14 @@ def _in_words(progress: Progress) -> str:
     return ", ".join(words)
 
 
+def print_plan(plan: Plan) -> None:
+    """Print what was decided for a run, on stdout."""
+    table = Table(title=f"plan for {plan.settings.camera.source}", show_header=False, title_justify="left")
+    for name, decision in plan.notes.items():
+        table.add_row(name, decision)
+    result_console().print(table)
+
+
 def print_summary(summary: Mapping[str, Any], title: str) -> None:
     """Print the tables of a run's summary on stdout."""
     console = result_console()
@@ -69,6 +82,13 @@ def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     sent, dropped = summary["frames_sent"], summary["dropped_at_the_door"]
     yield "frames sent / dropped at the door", f"{sent} / {dropped}"
     yield "frames / with a pose / lost", f"{summary['frames']} / {summary['poses_ok']} / {summary['frames_lost']}"
+    if summary["reasons"]:
+        yield "without a pose because", ", ".join(f"{reason} {count}x" for reason, count in summary["reasons"].items())
+    if summary["cameras"].keys() - {"calibrated"}:
+        yield (
+            "camera taken from",
+            ", ".join(f"{_CAMERAS[origin]} {count}x" for origin, count in summary["cameras"].items()),
+        )
     for key, what, unit in (
         ("rotation_error_deg", "rotation error: median, mean, p90", "deg"),
         ("translation_error", "translation error: median, mean, p90", "units"),

@@ -12,10 +12,13 @@ The keys of a summary, which programs may rely on:
                      null without any
   out_of_view        {frames, poses_ok}: frames whose truth says that the object is not in the picture
   rate_hz            finished frames a second, from the first frame sent to the last answer
-  latency_ms         {p50, p90, p99, by_stage}: from the camera's sending a frame to its final pose, all passes
-                     included; by_stage: name -> {p50, p90}, waiting and transport included
+  latency_ms         {p50, p90, p99, by_stage}: from the camera's sending a frame to its state, all passes included;
+                     by_stage: name -> {p50, p90}, waiting and transport included
   passes             mean number of passes over a frame
   states             tracking's state -> number of frames
+  reasons            why frames have no measured pose -> number of frames
+  cameras            where the intrinsics of frames come from -> number of frames; poses by an assumed one are not sure
+  plan               what was decided before the run, and why, by name
   messages           {recorded, lost}: lost are those that the recorder should have got and has not written (without
                      a recorder: those that a stage should have got)
   restarts           name of a process -> how often it came back
@@ -36,21 +39,11 @@ import numpy as np
 
 from fieldpose.bus.messages import Stats
 from fieldpose.bus.replay import RecordingInfo
-from fieldpose.bus.topics import CORRESPONDENCES, ESTIMATE, GUESS, MATCHES, POSE, VIEW
+from fieldpose.deploy.graph import AT_WORK
 from fieldpose.stages.geometry import rotation_error_deg, translation_error
 from fieldpose.stages.tracking.scoring import deviations
 
 Outcome = Literal["finished", "lost", "dropped"]
-
-STAGE_OF = {
-    GUESS.name: "tracking",
-    VIEW.name: "rendering",
-    MATCHES.name: "matching",
-    CORRESPONDENCES.name: "lifting",
-    ESTIMATE.name: "pnp",
-    POSE.name: "refinement",
-}
-"""Topic -> the stage that sends it, in the order in which a frame passes them."""
 
 CLOSE_DEG, CLOSE = 5.0, 0.05
 """The limits of the paper's table I, in degrees and in units of the field."""
@@ -78,6 +71,8 @@ class FrameResult:
     passes: int = 1
     state: str | None = None
     score: float = 0.0
+    reason: str | None = None
+    camera_origin: str | None = None
     cam_from_object: np.ndarray | None = None
     covariance: np.ndarray | None = None
     truth: TruthKnown | None = None
@@ -100,7 +95,7 @@ class FrameResult:
 
     @property
     def latency_ms(self) -> float | None:
-        """From the camera's sending to the final pose."""
+        """From the camera's sending to the state."""
         if self.outcome != "finished" or self.sent_ns is None or self.answered_ns is None:
             return None
         return (self.answered_ns - self.sent_ns) / 1e6
@@ -120,6 +115,7 @@ class RunResult:
     observed: Mapping[str, int] = field(default_factory=dict)
     restarts: Mapping[str, int] = field(default_factory=dict)
     recording: RecordingInfo | None = None
+    plan: Mapping[str, str] = field(default_factory=dict)
     interrupted: bool = False
     start_s: float = 0.0
 
@@ -139,6 +135,9 @@ def summarise(run: RunResult) -> dict[str, Any]:
         "latency_ms": {**_quantiles(latencies, (50, 90, 99)), "by_stage": _by_stage(admitted)},
         "passes": float(np.mean([result.passes for result in admitted])) if admitted else None,
         "states": dict(Counter(result.state for result in admitted if result.state is not None)),
+        "reasons": dict(Counter(result.reason for result in admitted if result.reason is not None)),
+        "cameras": dict(Counter(result.camera_origin for result in admitted if result.camera_origin is not None)),
+        "plan": dict(run.plan),
         "messages": _messages(run),
         "restarts": dict(run.restarts),
         "start_s": run.start_s,
@@ -180,15 +179,16 @@ def to_csv(results: Iterable[FrameResult]) -> bytes:
     text = io.StringIO()
     writer = csv.writer(text)
     writer.writerow(
-        ["frame_id", "capture_ns", "outcome", "state", "score", "passes", "latency_ms", "rotation_error_deg"]
-        + ["translation_error", "sigma_translation", "sigma_rotation_deg"]
+        ["frame_id", "capture_ns", "outcome", "state", "score", "reason", "camera", "passes", "latency_ms"]
+        + ["rotation_error_deg", "translation_error", "sigma_translation", "sigma_rotation_deg"]
         + [f"cam_from_object_{row}{column}" for row in range(3) for column in range(4)]
     )
     for result in results:
         turn, shift = result.errors or ("", "")
         sigmas = ("", "") if result.covariance is None else deviations(result.covariance)
         pose = [""] * 12 if result.cam_from_object is None else result.cam_from_object[:3].ravel().tolist()
-        columns = [result.frame_id, result.capture_ns, result.outcome, result.state, result.score, result.passes]
+        columns = [result.frame_id, result.capture_ns, result.outcome, result.state, result.score, result.reason]
+        columns += [result.camera_origin, result.passes]
         writer.writerow([*columns, result.latency_ms, turn, shift, *sigmas, *pose])
     return text.getvalue().encode()
 
@@ -208,7 +208,7 @@ def _messages(run: RunResult) -> dict[str, int]:
 
 
 def _by_stage(results: Sequence[FrameResult]) -> dict[str, dict[str, float | None]]:
-    stages = {name: [r.stage_ms[name] for r in results if name in r.stage_ms] for name in STAGE_OF.values()}
+    stages = {name: [r.stage_ms[name] for r in results if name in r.stage_ms] for name in AT_WORK}
     return {name: _quantiles(values, (50, 90)) for name, values in stages.items()}
 
 

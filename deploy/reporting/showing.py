@@ -14,9 +14,9 @@ import numpy as np
 from fieldpose.bus.messages import Frame
 from fieldpose.bus.replay import read_recording
 from fieldpose.bus.topics import FRAME
-from fieldpose.deploy.errors import OutputError
 from fieldpose.deploy.reporting.overlay import VideoFile, captioned, overlaid, without_distortion
 from fieldpose.deploy.reporting.results import FrameResult
+from fieldpose.errors import OutputError
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 

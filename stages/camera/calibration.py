@@ -1,8 +1,9 @@
-"""Which camera took an image: from a file, from what the image says of itself, or from an assumed field of view."""
+"""Which camera took an image: from a file, from the training views, from what the image says, or assumed."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,50 +12,70 @@ import msgspec
 import numpy as np
 from PIL import Image
 
-from fieldpose.bus.messages import CameraModel
+from fieldpose.bus.messages import CameraOrigin
+from fieldpose.errors import FieldposeError, SourceError
 from fieldpose.stages.camera.config import CameraConfig
-from fieldpose.stages.errors import SourceError, StageError
 from fieldpose.stages.geometry import Camera
 
 _EXIF_IFD = 0x8769
 _FOCAL_LENGTH_35MM = 0xA405
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _ASPECT_TOLERANCE = 0.01
+_OTHER_LENS = 1.2
+"""Focal lengths that differ by more are not those of one lens: fitted ones differ from EXIF's by a few percent, a
+phone's lenses from each other by half and more."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """The camera of an image, and where it was taken from."""
+    """The camera of an image, where it was taken from, and that in words."""
 
     camera: Camera
-    origin: str
+    origin: CameraOrigin
+    told: str
 
 
-def calibrate(config: CameraConfig, width: int, height: int, image: Path | None = None) -> Calibration:
-    """The camera of an image of that size: config.camera_file, else the image file's EXIF, else config.fov_deg.
+class Calibrator:
+    """Finds the camera of images; `known` are the cameras of the field's training views."""
 
-    Raises SourceError if the camera file cannot be used, or is of images of another shape.
-    """
-    if config.camera_file is not None:
-        stated = read_camera_file(config.camera_file)
-        return Calibration(
-            _fitted(stated, width, height, config.camera_file), f"calibration from {config.camera_file}"
-        )
-    focal = None if image is None else focal_length_from_exif(image, width, height)
-    if focal is not None:
-        return Calibration(_centred(width, height, focal), "focal length from EXIF")
-    focal = 0.5 * max(width, height) / math.tan(math.radians(config.fov_deg) / 2)
-    return Calibration(_centred(width, height, focal), f"assumed field of view of {config.fov_deg:g} degrees")
+    def __init__(self, config: CameraConfig, known: Sequence[Camera] = ()) -> None:
+        self._config, self._known = config, known
+
+    def of(self, width: int, height: int, image: Path | None = None) -> Calibration:
+        """The camera of an image of that size, and maybe with a file.
+
+        In this order: config.camera_file; the training views' camera where the shape is theirs, unless EXIF tells of
+        another lens; EXIF; config.fov_deg. Raises SourceError if the camera file cannot be used, or is of images of
+        another shape.
+        """
+        path = self._config.camera_file
+        if path is not None:
+            fitted = _fitted(read_camera_file(path), width, height, path)
+            return Calibration(fitted, CameraOrigin.CALIBRATED, f"calibration from {path}")
+        focal = None if image is None else focal_length_from_exif(image, width, height)
+        trained = self._trained(width, height)
+        if trained is not None and (focal is None or _alike(focal, trained.fx)):
+            return Calibration(trained, CameraOrigin.TRAINING, "the camera of the training views")
+        if focal is not None:
+            return Calibration(_centred(width, height, focal), CameraOrigin.EXIF, "focal length from EXIF")
+        fov_deg = self._config.fov_deg
+        focal = 0.5 * max(width, height) / math.tan(math.radians(fov_deg) / 2)
+        told = f"assumed field of view of {fov_deg:g} degrees; give --camera.camera-file"
+        return Calibration(_centred(width, height, focal), CameraOrigin.ASSUMED, told)
+
+    def _trained(self, width: int, height: int) -> Camera | None:
+        """The training camera of that shape, at that size; of several the one of median focal length."""
+        shaped = [camera.resized(width, height) for camera in self._known if _same_shape(camera, width, height)]
+        return sorted(shaped, key=lambda camera: camera.fx)[len(shaped) // 2] if shaped else None
 
 
 def read_camera_file(path: Path) -> Camera:
     """Read a JSON file of width, height, fx, fy, cx, cy and, if there is any, distortion. Raises SourceError."""
     try:
-        model = msgspec.json.decode(path.read_bytes(), type=CameraModel)
-        return Camera(**msgspec.structs.asdict(model))
+        return msgspec.json.decode(path.read_bytes(), type=Camera)
     except FileNotFoundError:
         raise SourceError(f"{path}: no such camera file") from None
-    except (OSError, msgspec.DecodeError, StageError) as error:
+    except (OSError, msgspec.DecodeError, FieldposeError) as error:
         raise SourceError(
             f"{path}: no usable camera file ({error}); it needs width, height, fx, fy, cx, cy in pixels, and may"
             " have distortion as [k1, k2, p1, p2, k3]"
@@ -86,8 +107,16 @@ def _centred(width: int, height: int, focal: float) -> Camera:
 
 
 def _fitted(camera: Camera, width: int, height: int, path: Path) -> Camera:
-    if abs(camera.width * height - camera.height * width) > _ASPECT_TOLERANCE * camera.width * height:
+    if not _same_shape(camera, width, height):
         raise SourceError(
             f"{path}: is of {camera.width}x{camera.height} images, but these are {width}x{height}, another shape"
         )
     return camera.resized(width, height)
+
+
+def _same_shape(camera: Camera, width: int, height: int) -> bool:
+    return abs(camera.width * height - camera.height * width) <= _ASPECT_TOLERANCE * camera.width * height
+
+
+def _alike(focal: float, other: float) -> bool:
+    return max(focal, other) <= _OTHER_LENS * min(focal, other)

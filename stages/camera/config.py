@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from fieldpose.stages.errors import ConfigError
+from fieldpose.errors import ConfigError
 
 Pace = Literal["auto", "live", "lockstep", "fast"]
 

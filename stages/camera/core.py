@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
+from fieldpose.bus.messages import CameraOrigin
+from fieldpose.errors import ConfigError
 from fieldpose.stages.camera.config import CameraConfig, Pace
-from fieldpose.stages.errors import ConfigError
 from fieldpose.stages.geometry import Camera
 
 _BURST = 8
@@ -38,11 +39,12 @@ class CapturedFrame:
     name: str
     at_ns: int | None = None
     truth: TruePose | None = None
+    origin: CameraOrigin = CameraOrigin.CALIBRATED
 
 
 @dataclass(frozen=True)
 class Source:
-    """`frames(first)` reads from the frame at that place on; it raises StageError where one cannot be read.
+    """`frames(first)` reads from the frame at that place on; it raises FieldposeError where one cannot be read.
 
     clock: "own" for frames with times since some moment of their own, "wall" since the epoch, as they are taken.
     """

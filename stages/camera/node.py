@@ -3,38 +3,44 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
 
 from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.messages import Message
 from fieldpose.bus.node import EndOfInput, Output
-from fieldpose.bus.topics import FRAME, POSE, STATE, TRUTH, Topic
+from fieldpose.bus.topics import CAMERA_INFO, FAILURE, FRAME, POSE, STATE, TRUTH, Topic
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.sender import Sender
+from fieldpose.stages.geometry import Camera
 
 
 class CameraNode:
     """A Handler that ends by itself, once the last frame of its source is answered.
 
-    `wait_until_ready` is called before the first frame, for instance to wait for the stages that will work on it.
-    Raises StageErrors at start, and at stop the one that ended the source early.
+    `known` gives the cameras of the training views. `wait_until_ready` is called before the first frame, for instance
+    to wait for the stages that will work on it. Raises FieldposeErrors at start, and at stop the one that ended the
+    source early.
     """
 
     name = "camera"
-    inputs: tuple[Topic, ...] = (STATE, POSE)
-    outputs: tuple[Topic, ...] = (FRAME, TRUTH)
+    inputs: tuple[Topic[Any], ...] = (STATE, POSE, FAILURE)
+    outputs: tuple[Topic[Any], ...] = (TRUTH, FRAME, CAMERA_INFO)
 
-    def __init__(self, config: CameraConfig, wait_until_ready: Callable[[], None] = lambda: None) -> None:
-        self._config = config
+    def __init__(
+        self, config: CameraConfig, known: Callable[[], Sequence[Camera]] = tuple,
+        wait_until_ready: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
+        self._config, self._known = config, known
         self._wait_until_ready = wait_until_ready
         self._sender: Sender | None = None
 
     def start(self) -> None:
-        self._sender = Sender(self._config)
+        self._sender = Sender(self._config, self._known())
         stage_logger(self.name).info("source", what=self._sender.description)
         self._wait_until_ready()
 
-    def handle(self, topic: Topic, message: Message) -> Iterable[Output]:
+    def handle(self, topic: Topic[Any], message: Message) -> Iterable[Output]:
         now_ns = time.time_ns()
         self._opened.heard(message, now_ns)
         return self.tick(now_ns)  # or an answer would wait up to 20 ms for the next frame

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from fieldpose.bus.messages import Message, State
 from fieldpose.bus.node import Output
+from fieldpose.errors import FieldposeError, SourceError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import Feed
 from fieldpose.stages.camera.progress import Progress
 from fieldpose.stages.camera.sources import open_source
 from fieldpose.stages.camera.wire import messages_of
-from fieldpose.stages.errors import SourceError, StageError
+from fieldpose.stages.geometry import Camera
 
 
 class Sender:
-    """Sends config.source, from where its progress file says. Raises StageErrors where it cannot be opened."""
+    """Sends config.source, from where its progress file says. Raises FieldposeErrors where it cannot be opened."""
 
-    def __init__(self, config: CameraConfig) -> None:
-        source = open_source(config)
+    def __init__(self, config: CameraConfig, known: Sequence[Camera] = ()) -> None:
+        source = open_source(config, known)
         self.description = source.description
         self._progress = Progress(config.progress_file, config.source)
         self._feed = Feed(source, config, self._progress.next)
-        self._error: StageError | None = None
+        self._error: FieldposeError | None = None
 
     def messages(self, now_ns: int) -> Iterator[Output]:
         """What is to be sent now; progress is noted after each frame."""
@@ -30,11 +31,11 @@ class Sender:
             for frame, capture_ns in self._feed.due(now_ns):
                 yield from messages_of(frame, capture_ns)
                 self._progress.advance()
-        except (StageError, OSError) as error:
-            self._error = error if isinstance(error, StageError) else SourceError(str(error))
+        except (FieldposeError, OSError) as error:
+            self._error = error if isinstance(error, FieldposeError) else SourceError(str(error))
 
     def heard(self, message: Message, now_ns: int) -> None:
-        """Take in a State or a Pose: a frame is answered, or a pass over it has come back."""
+        """Take in a State, Pose or Failure: a frame is answered, or a pass over it has come back."""
         if isinstance(message, State):
             self._feed.answered(message.header.frame_id, message.in_flight, now_ns)
         else:
@@ -45,7 +46,7 @@ class Sender:
         return self._error is not None or self._feed.over(now_ns)
 
     def close(self) -> None:
-        """Let go of the source. Raises the StageError that ended it early, if one did."""
+        """Let go of the source. Raises the FieldposeError that ended it early, if one did."""
         self._feed.close()
         if self._error is not None:
             raise self._error

@@ -5,20 +5,22 @@ Axes are OpenCV's (x right, y down, z forward); pixel (0, 0) is the centre of th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
+import msgspec
 import numpy as np
 
-from fieldpose.stages.errors import StageError
+from fieldpose.errors import GeometryError
 
+_LARGEST = 16384
 _UNDISTORTED = (0.0, 0.0, 0.0, 0.0, 0.0)
 _NEWTON_STEPS = 25
 _INVERSE_TOLERANCE_PX = 1e-4
 
 
-@dataclass(frozen=True)
-class Camera:
-    """Intrinsics in pixels; distortion is OpenCV's k1 k2 p1 p2 k3. StageError if they make no camera."""
+class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Intrinsics in pixels; distortion is OpenCV's k1 k2 p1 p2 k3. GeometryError if they make no camera.
+
+    It is also the camera of messages and of files.
+    """
 
     width: int
     height: int
@@ -31,9 +33,9 @@ class Camera:
     def __post_init__(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if len(self.distortion) != 5 or not np.all(np.isfinite(numbers)):
-            raise StageError(f"a camera needs finite intrinsics and five distortion coefficients, got {self}")
-        if min(self.width, self.height) < 1 or min(self.fx, self.fy) <= 0:
-            raise StageError(f"a camera needs a positive size and positive focal lengths, got {self}")
+            raise GeometryError(f"a camera needs finite intrinsics and five distortion coefficients, got {self}")
+        if not (1 <= self.width <= _LARGEST and 1 <= self.height <= _LARGEST and self.fx > 0 and self.fy > 0):
+            raise GeometryError(f"a camera needs a size of 1 to {_LARGEST} and positive focal lengths, got {self}")
 
     def matrix(self) -> np.ndarray:
         """The (3, 3) intrinsic matrix, distortion left out."""
@@ -43,7 +45,7 @@ class Camera:
         """The camera of this image resized to (width, height); a pixel's area is scaled, not its centre."""
         sx, sy = width / self.width, height / self.height
         cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
-        return replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=cx, cy=cy)
+        return msgspec.structs.replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=cx, cy=cy)
 
     def scaled(self, factor: float) -> Camera:
         """resized() by a factor, to the nearest whole size."""
@@ -51,7 +53,7 @@ class Camera:
 
     def undistorted(self) -> Camera:
         """The same camera without distortion."""
-        return replace(self, distortion=_UNDISTORTED)
+        return msgspec.structs.replace(self, distortion=_UNDISTORTED)
 
     @property
     def is_distorted(self) -> bool:
@@ -66,12 +68,12 @@ class Camera:
     def directions(self, pixels: np.ndarray) -> np.ndarray:
         """Directions (n, 3) float32 in the camera frame with z = 1 through pixels (n, 2), distortion removed.
 
-        StageError where the distortion has no inverse (it folds the image over itself at that pixel).
+        GeometryError where the distortion has no inverse (it folds the image over itself at that pixel).
         """
         ideal, usable = self._ideal(pixels)
         if not usable.all():
             worst = np.asarray(pixels)[np.argmin(usable)]
-            raise StageError(
+            raise GeometryError(
                 f"the distortion {self.distortion} has no inverse at pixel ({worst[0]:.1f}, {worst[1]:.1f});"
                 " recalibrate the camera or crop the image to where the model is valid"
             )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from fieldpose.stages.errors import StageError
+from fieldpose.errors import GeometryError
 
 _SMALL_ANGLE = 1e-4
 
@@ -92,7 +92,7 @@ def nearest_rigid(transform: np.ndarray) -> np.ndarray:
 
 
 def rotation_about(axis: ArrayLike, angle_rad: float) -> np.ndarray:
-    """Rotation (4, 4) by angle_rad about an axis (3,) through the origin. StageError if the axis is zero."""
+    """Rotation (4, 4) by angle_rad about an axis (3,) through the origin. GeometryError if the axis is zero."""
     return from_rotation(Rotation.from_rotvec(angle_rad * _unit(axis, "the axis of a rotation")))
 
 
@@ -104,7 +104,7 @@ def interpolate(start: np.ndarray, end: np.ndarray, alpha: float) -> np.ndarray:
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> np.ndarray:
     """cam_from_object (OpenCV axes) of a camera at eye that looks at target with up towards the image's top.
 
-    Raises StageError if eye and target coincide or up is parallel to the viewing direction.
+    Raises GeometryError if eye and target coincide or up is parallel to the viewing direction.
     """
     centre = np.asarray(eye, dtype=np.float64)
     forward = _unit(np.asarray(target, dtype=np.float64) - centre, "the viewing direction of look_at")
@@ -122,5 +122,5 @@ def _unit(vector: ArrayLike, what: str) -> np.ndarray:
     values = np.asarray(vector, dtype=np.float64)
     length = float(np.linalg.norm(values))
     if values.shape != (3,) or not 1e-12 < length < np.inf:
-        raise StageError(f"{what} must be a finite vector of 3 numbers that is not zero, got {values.tolist()}")
+        raise GeometryError(f"{what} must be a finite vector of 3 numbers that is not zero, got {values.tolist()}")
     return values / length

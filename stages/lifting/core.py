@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fieldpose.bus.messages import Reason
 from fieldpose.stages.geometry import Camera, camera_centre, points_at_depth
 from fieldpose.stages.lifting.config import LiftingConfig
 from fieldpose.stages.lifting.memory import ConsistencyMemory, Remember
@@ -42,12 +43,13 @@ def lift(
     rng: np.random.Generator,
     config: LiftingConfig | None = None,
     remember: Remember | None = None,
-) -> Lifted:
+) -> Lifted | Reason:
     """Lift pixels (n, 2) of a view and mark the points to keep.
 
     depth (h, w) along the optical axis, opacity (h, w) in 0..1 or uint8, camera and cam_from_object are the view's.
     `rng` turns the ring of nearby views; the renderer is asked once, for all points and views, or for those pixels
-    alone that `remember`, for a view that comes again, does not know.
+    alone that `remember`, for a view that comes again, does not know. TOO_FEW_CONSISTENT_POINTS where less are kept
+    than the configuration asks for.
     """
     config = config or LiftingConfig()
     depths = depth_at(depth, pixels_in_view, config.max_depth_step)
@@ -65,7 +67,8 @@ def lift(
         spread[seen] = look(slice(None)) if remember is None else remember(pixels_in_view[seen], look)
     unit = 1.0 if config.gamma_unit == "field" else depths / camera.fx
     displacement = np.where(seen, np.sqrt(spread) / np.maximum(config.gamma * unit, 1e-12), np.inf)
-    return Lifted(points, spread, _consistent(displacement, config))
+    kept = _consistent(displacement, config)
+    return Lifted(points, spread, kept) if kept.sum() >= config.min_kept else Reason.TOO_FEW_CONSISTENT_POINTS
 
 
 def _consistent(displacement: np.ndarray, config: LiftingConfig) -> np.ndarray:

@@ -1,56 +1,52 @@
-"""Lifting as a process: matches, their view and guess in, correspondences out."""
+"""Lifting as a process: matches and their view in, correspondences out."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from pathlib import Path
-from typing import cast
+import hashlib
+from collections.abc import Callable
 
 import numpy as np
 
-from fieldpose.bus.messages import Correspondences, Guess, Header, Matches, Message, Reason, View
-from fieldpose.bus.node import JoinedHandler, Output, reply_header
-from fieldpose.bus.topics import CORRESPONDENCES, GUESS, MATCHES, VIEW, Topic
+from fieldpose.bus.messages import Correspondences, Message, Reason
+from fieldpose.bus.node import Joined, JoinedHandler
+from fieldpose.bus.topics import CORRESPONDENCES, MATCHES, VIEW
 from fieldpose.stages.lifting.config import LiftingConfig
 from fieldpose.stages.lifting.core import ConsistencyMemory, lift
-from fieldpose.stages.nerf.loading import load_renderer, warm_up
-from fieldpose.stages.wire import NO_CAMERA, camera_of, frame_rng
+from fieldpose.stages.nerf.rendering_api import RayRenderer
 
 
 class LiftingNode(JoinedHandler):
-    """Lifts the matches of each view; the guess tells the frame's camera. Raises FieldFileError at start."""
+    """Lifts the matches of each view, by the field that `make_renderer` gives at start."""
 
     name = "lifting"
-    inputs: tuple[Topic, ...] = (MATCHES, VIEW, GUESS)
-    outputs: tuple[Topic, ...] = (CORRESPONDENCES,)
+    inputs = (MATCHES, VIEW)
+    output = CORRESPONDENCES
 
-    def __init__(self, field: Path, config: LiftingConfig, threads: int = 1) -> None:
+    def __init__(
+        self, make_renderer: Callable[[], RayRenderer], config: LiftingConfig, memory: ConsistencyMemory
+    ) -> None:
         super().__init__()
-        self._field, self._config, self._threads = field, config, threads
+        self._make_renderer, self._config, self._memory = make_renderer, config, memory
 
     def start(self) -> None:
-        self._renderer, self._memory = load_renderer(self._field, self._threads), ConsistencyMemory()
-        warm_up(self._renderer)
+        self._renderer = self._make_renderer()
 
-    def process(self, joined: dict[Topic, Message]) -> Iterable[Output]:
-        matches, view = cast(Matches, joined[MATCHES]), cast(View, joined[VIEW])
-        guess, header = cast(Guess, joined[GUESS]), reply_header(matches.header)
+    def answer(self, joined: Joined) -> Message | Reason:
+        matches, view = joined[MATCHES], joined[VIEW]
+        pose = np.array(view.cam_from_object)
         lifted = lift(
-            self._renderer, view.depth, view.opacity, camera_of(view.camera), np.array(view.cam_from_object),
-            matches.pixels_in_view, frame_rng(header), self._config, self._memory.of(view.view_id),
+            self._renderer, view.depth, view.opacity, view.camera, pose, matches.pixels_in_view,
+            view_rng(view.view_id), self._config, self._memory.of(view.view_id),
         )  # fmt: skip
-        ok = bool(lifted.kept.sum() >= self._config.min_kept)
-        reason = Reason.OK if ok else Reason.TOO_FEW_CONSISTENT_POINTS
-        yield CORRESPONDENCES, Correspondences(
-            header=header, ok=ok, reason=reason, camera=guess.camera, guess_cam_from_object=guess.cam_from_object,
-            pixels_in_frame=matches.pixels_in_frame, points_in_object=lifted.points_in_object,
-            confidence=matches.confidence, consistency=lifted.consistency, kept=lifted.kept,
+        if isinstance(lifted, Reason):
+            return lifted
+        return Correspondences(
+            header=joined.header, view_cam_from_object=pose, pixels_in_frame=matches.pixels_in_frame,
+            points_in_object=lifted.points_in_object, confidence=matches.confidence, consistency=lifted.consistency,
+            kept=lifted.kept,
         )  # fmt: skip
 
-    def failure(self, header: Header, reason: Reason) -> Iterable[Output]:
-        none = np.zeros(0, np.float32)
-        yield CORRESPONDENCES, Correspondences(
-            header=reply_header(header), ok=False, reason=reason, camera=NO_CAMERA, guess_cam_from_object=np.eye(4),
-            pixels_in_frame=none.reshape(0, 2), points_in_object=none.reshape(0, 3), confidence=none,
-            consistency=none, kept=np.zeros(0, bool),
-        )  # fmt: skip
+
+def view_rng(view_id: str) -> np.random.Generator:
+    """Random numbers that a view has each time: a point's consistency is then the same whichever frame asks for it."""
+    return np.random.default_rng(int.from_bytes(hashlib.sha256(view_id.encode()).digest()[:8], "little"))

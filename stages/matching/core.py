@@ -15,7 +15,8 @@ from typing import Any, Protocol, runtime_checkable
 import cv2
 import numpy as np
 
-from fieldpose.stages.errors import ConfigError
+from fieldpose.bus.messages import Reason
+from fieldpose.errors import ConfigError
 from fieldpose.stages.last_used import LastUsed
 from fieldpose.stages.matching.subpixel import align_patches
 
@@ -58,8 +59,13 @@ class MatchingConfig:
     """file or folder of network weights, in place of an installed package's"""
     allow_download: bool = False
     """let kornia download weights that are neither given nor installed"""
-    device: str = "cpu"
-    """torch device of the networks"""
+    device: str = "auto"
+    """torch device of the networks; auto: that of the backend"""
+
+    @property
+    def torch_device(self) -> str:
+        """The device, where it was not left open."""
+        return "cpu" if self.device == "auto" else self.device
 
 
 @dataclass(frozen=True)
@@ -132,8 +138,9 @@ def shrink(image: np.ndarray, longer_side: int) -> tuple[np.ndarray, np.ndarray]
 class PairMatcher:
     """Matches views with frames and keeps the features of the last ones, for views and frames that come again."""
 
-    def __init__(self, matcher: Matcher, config: MatchingConfig) -> None:
-        self._matcher, self._config = matcher, config
+    def __init__(self, matcher: Matcher, config: MatchingConfig, at_once: bool = True) -> None:
+        """at_once: two new images in one go, which is faster, and rounds otherwise than one after the other."""
+        self._matcher, self._config, self._at_once = matcher, config, at_once
         self._views: LastUsed[_Seen] = LastUsed(config.kept_views)
         self._frames: LastUsed[_Seen] = LastUsed(_KEPT_FRAMES)
 
@@ -144,14 +151,17 @@ class PairMatcher:
         frame_image: np.ndarray,
         view_key: Hashable | None = None,
         frame_key: Hashable | None = None,
-    ) -> MatchedPixels:
+    ) -> MatchedPixels | Reason:
         """Match a view (h, w, 3) uint8 with opacity (h, w) and a frame (h', w', 3) uint8, in their own pixels.
 
         Only pixels of the view that show the object are matched. Features are kept under the keys, where given.
+        TOO_FEW_MATCHES where they are less than the configuration asks for.
         """
         longer_side = self._config.frame_size or max(view_rgb.shape[:2])
         view, frame = self._both(view_rgb, view_opacity, frame_image, longer_side, view_key, frame_key)
         matched = self._matcher.match(view.features, frame.features)
+        if len(matched.confidence) < self._config.min_matches:
+            return Reason.TOO_FEW_MATCHES
         pixels_b, confidence = matched.pixels_b, matched.confidence
         if self._config.patch_px and not self._matcher.placed_between_pixels:
             window = self._config.patch_px
@@ -175,7 +185,7 @@ class PairMatcher:
         sized_key = _sized(frame_key, longer_side)
         alike = _shrunk_size(frame_image, longer_side) == (rgb.shape[1], rgb.shape[0])
         new = view_key not in self._views and sized_key not in self._frames
-        if alike and new and isinstance(self._matcher, ExtractsAtOnce):
+        if self._at_once and alike and new and isinstance(self._matcher, ExtractsAtOnce):
             mask, (small, scale) = visible_mask(opacity, self._config.erode_px), shrink(frame_image, longer_side)
             in_view, in_frame = self._matcher.extract_all([(rgb, mask), (small, None)])
             view = self._views.get(view_key, lambda: _seen(in_view, rgb))

@@ -67,12 +67,12 @@ class LightGlueMatcher:
     placed_between_pixels = False
 
     def __init__(self, detector: Extract, weights: WeightsFile, config: MatchingConfig, **settings: Any) -> None:
-        self._detector, self._device = detector, config.device
+        self._detector, self._device = detector, config.torch_device
         min_score = _MIN_SCORE if config.min_confidence is None else config.min_confidence
         path = find_weights(weights, config.weights, config.allow_download)
         without_weights: Any = None  # kornia's annotation leaves out the None that it documents
         network = LightGlue(without_weights, filter_threshold=min_score, **settings)
-        self._network = load_network(network, path, config.device, _lightglue_name)
+        self._network = load_network(network, path, config.torch_device, _lightglue_name)
 
     def extract(self, image: np.ndarray, mask: np.ndarray | None = None) -> Features:
         """The detector's features of an image (h, w, 3) uint8 where mask (h, w) bool is true."""
@@ -104,8 +104,8 @@ class AlikedExtractor:
     def __init__(self, config: MatchingConfig) -> None:
         path = find_weights(ALIKED_DETECTOR, config.weights, config.allow_download)
         network = ALIKED("aliked-n16", config.max_keypoints, _ALIKED_THRESHOLD)
-        self._network: Any = load_network(network, path, config.device)
-        self._device = config.device
+        self._network: Any = load_network(network, path, config.torch_device)
+        self._device = config.torch_device
 
     @torch.inference_mode()
     def extract(self, image: np.ndarray, mask: np.ndarray | None = None) -> Features:
@@ -121,8 +121,8 @@ class DiskExtractor:
 
     def __init__(self, config: MatchingConfig) -> None:
         path = find_weights(DISK_DETECTOR, config.weights, config.allow_download)
-        self._network = load_network(DISK(), path, config.device)
-        self._max_keypoints, self._device = config.max_keypoints, config.device
+        self._network = load_network(DISK(), path, config.torch_device)
+        self._max_keypoints, self._device = config.max_keypoints, config.torch_device
 
     @torch.inference_mode()
     def extract(self, image: np.ndarray, mask: np.ndarray | None = None) -> Features:

@@ -34,8 +34,8 @@ class LoFTRMatcher:
         settings: Any = copy.deepcopy(default_cfg)
         if config.min_confidence is not None:
             settings["match_coarse"]["thr"] = config.min_confidence
-        self._network: Any = load_network(LoFTR(None, settings), path, config.device, _name_in_network)
-        self._device = config.device
+        self._network: Any = load_network(LoFTR(None, settings), path, config.torch_device, _name_in_network)
+        self._device = config.torch_device
 
     @torch.inference_mode()
     def extract(self, image: np.ndarray, mask: np.ndarray | None = None) -> Features:

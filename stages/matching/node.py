@@ -2,61 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import cast
+from collections.abc import Callable
 
 import numpy as np
 
-from fieldpose.bus.messages import Frame, Header, Matches, Message, Reason, View
-from fieldpose.bus.node import JoinedHandler, Output, reply_header
-from fieldpose.bus.topics import FRAME, MATCHES, VIEW, Topic
-from fieldpose.stages.matching.core import MatchingConfig, PairMatcher, build_matcher
-from fieldpose.stages.wire import frame_image
+from fieldpose.bus.messages import Matches, Message, Reason
+from fieldpose.bus.node import Joined, JoinedHandler
+from fieldpose.bus.topics import FRAME, MATCHES, VIEW
+from fieldpose.stages.matching.core import PairMatcher
+from fieldpose.stages.wire import FrameImages
+
+_WARM_UP_PX = 400
 
 
 class MatchingNode(JoinedHandler):
-    """Matches each view with its frame. Raises ConfigError and WeightsError at start."""
+    """Matches each view with its frame, by what `make_pairs` gives at start."""
 
     name = "matching"
-    inputs: tuple[Topic, ...] = (VIEW, FRAME)
-    outputs: tuple[Topic, ...] = (MATCHES,)
+    inputs = (VIEW, FRAME)
+    output = MATCHES
 
-    def __init__(self, config: MatchingConfig) -> None:
+    def __init__(self, make_pairs: Callable[[], PairMatcher], images: FrameImages) -> None:
         super().__init__()
-        self._config = config
+        self._make_pairs, self._images = make_pairs, images
 
     def start(self) -> None:
-        matcher = build_matcher(self._config)
-        self._pairs = PairMatcher(matcher, self._config)
-        noise = np.random.default_rng(0).integers(0, 256, (400, 400, 3), np.uint8)
-        solid, once = np.ones((400, 400), np.float32), PairMatcher(matcher, self._config)
+        self._pairs = self._make_pairs()
+        noise = np.random.default_rng(0).integers(0, 256, (_WARM_UP_PX, _WARM_UP_PX, 3), np.uint8)
+        solid = np.ones(noise.shape[:2], np.float32)
         # The first inferences are slow, for networks choose their kernels in them: for two images, and for one, which
         # a frame is whose view comes again.
-        for frame_key in range(2):
-            once.match(noise, solid, noise, "noise", frame_key)
+        for frame_key in ("warm-up", "again"):
+            self._pairs.match(noise, solid, noise, "warm-up", frame_key)
 
-    def process(self, joined: dict[Topic, Message]) -> Iterable[Output]:
-        view, frame = cast(View, joined[VIEW]), cast(Frame, joined[FRAME])
-        image = frame_image(frame)
+    def answer(self, joined: Joined) -> Message | Reason:
+        view, image = joined[VIEW], self._images.of(joined[FRAME])
         if image is None:
-            yield from self.failure(view.header, Reason.FRAME_UNREADABLE)
-            return
-        frame_key = (frame.header.frame_id, frame.header.capture_ns)
-        matched = self._pairs.match(view.rgb, view.opacity, image, view.view_id, frame_key)
-        ok = len(matched.confidence) >= self._config.min_matches
-        yield MATCHES, Matches(
-            header=reply_header(view.header),
-            ok=ok,
-            reason=Reason.OK if ok else Reason.TOO_FEW_MATCHES,
-            view_id=view.view_id,
-            pixels_in_view=matched.pixels_a,
-            pixels_in_frame=matched.pixels_b,
-            confidence=matched.confidence,
-        )  # fmt: skip
-
-    def failure(self, header: Header, reason: Reason) -> Iterable[Output]:
-        pixels, confidence = np.zeros((0, 2), np.float32), np.zeros(0, np.float32)
-        yield MATCHES, Matches(
-            header=reply_header(header), ok=False, reason=reason, view_id="",
-            pixels_in_view=pixels, pixels_in_frame=pixels, confidence=confidence,
+            return Reason.FRAME_UNREADABLE
+        matched = self._pairs.match(view.rgb, view.opacity, image, view.view_id, joined.frame_key)
+        if isinstance(matched, Reason):
+            return matched
+        return Matches(
+            header=joined.header, view_id=view.view_id, pixels_in_view=matched.pixels_a,
+            pixels_in_frame=matched.pixels_b, confidence=matched.confidence,
         )  # fmt: skip

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
-from fieldpose.stages.errors import WeightsError
+from fieldpose.errors import WeightsError
 
 _DERIVED = {"confidence_thresholds", "hw_grid", "num_batches_tracked"}
 """Buffers that a network computes itself; files may lack them."""

@@ -39,10 +39,10 @@ class XFeatExtractor:
 
     def __init__(self, config: MatchingConfig) -> None:
         path = find_weights(WEIGHTS, config.weights, config.allow_download)
-        network = _without_norms(load_network(XFeatModel(), path, config.device))
+        network = _without_norms(load_network(XFeatModel(), path, config.torch_device))
         network.norm = torch.nn.Identity()
         self._network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._max_keypoints, self._device = config.max_keypoints, config.device
+        self._max_keypoints, self._device = config.max_keypoints, config.torch_device
 
     def extract(self, image: np.ndarray, mask: np.ndarray | None = None) -> Features:
         """Features of an image (h, w, 3) uint8 where mask (h, w) bool is true."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from fieldpose.stages.errors import ConfigError
+from fieldpose.errors import ConfigError
 
-Backend = Literal["numba", "torch", "cuda"]
-"""Compiled kernels on the CPU; torch on the CPU (slow, plain); torch on a CUDA device."""
+Backend = Literal["auto", "numba", "torch", "cuda"]
+"""Compiled kernels on the CPU; torch on the CPU (slow, plain); torch on a CUDA device; auto: on that, if any."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,9 @@ class TrainingConfig:
     """Wall-clock time of the training loop."""
     steps: int | None = None
     """Stop after so many steps instead."""
-    backend: Backend = "numba"
-    """numba: compiled kernels on the CPU; cuda: torch on a CUDA device; torch: the same on the CPU, for comparison."""
+    backend: Backend = "auto"
+    """numba: compiled kernels on the CPU; cuda: torch on a CUDA device; auto: cuda where there is one; torch: the same
+    on the CPU, for comparison."""
     seed: int = 0
     samples_per_step: int = 1 << 15
     """Rays are added to a step until they carry about so many samples."""

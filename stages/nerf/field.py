@@ -11,7 +11,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from fieldpose.stages.errors import FieldFileError
+from fieldpose.errors import FieldFileError
 from fieldpose.stages.nerf.config import FieldConfig
 from fieldpose.stages.nerf.kernels.space import BLOCK
 from fieldpose.stages.nerf.kernels.types import SH_SIZE, Domain, Net

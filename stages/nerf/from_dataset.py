@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
+from fieldpose.stages.nerf.backend import resolved
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.datasets import Dataset, load_dataset
 from fieldpose.stages.nerf.datasets.images import over_background
@@ -147,12 +148,13 @@ def train_field(
 
 def make_learner(views: list[View], space: Space, config: FieldConfig, training: TrainingConfig) -> Learner:
     """Compiled kernels, or torch on the CPU or on CUDA. Raises ConfigError where there is no CUDA device."""
-    if training.backend == "numba":
+    backend = resolved(training.backend)
+    if backend == "numba":
         return Trainer(views, space, config, training)
     from fieldpose.stages.nerf.torch_renderer import torch_device
     from fieldpose.stages.nerf.torch_training import TorchTrainer
 
-    return TorchTrainer(views, space, config, training, torch_device(training.backend))
+    return TorchTrainer(views, space, config, training, torch_device(backend))
 
 
 def replace_metadata(metadata: FieldMetadata, **changes: object) -> FieldMetadata:

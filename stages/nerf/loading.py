@@ -7,19 +7,21 @@ from pathlib import Path
 import numpy as np
 
 from fieldpose.stages.geometry import Camera
+from fieldpose.stages.nerf.backend import resolved
 from fieldpose.stages.nerf.config import Backend
 from fieldpose.stages.nerf.field import Field, load_field
 from fieldpose.stages.nerf.renderer import NumbaRenderer
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 
 
-def load_renderer(path: str | Path, threads: int = 1, backend: Backend = "numba") -> RayRenderer:
+def load_renderer(path: str | Path, threads: int = 1, backend: Backend = "auto") -> RayRenderer:
     """Open a field for rendering. Raises FieldFileError for a bad file, ConfigError for a bad backend."""
     return make_renderer(load_field(Path(path)), threads, backend)
 
 
-def make_renderer(field: Field, threads: int = 1, backend: Backend = "numba") -> RayRenderer:
+def make_renderer(field: Field, threads: int = 1, backend: Backend = "auto") -> RayRenderer:
     """A renderer of a field in memory. Raises ConfigError where there is no CUDA device."""
+    backend = resolved(backend)
     if backend == "numba":
         return NumbaRenderer(field, threads)
     # Torch takes 200 MB and seconds to import; a process that only renders on the CPU does without.

@@ -42,7 +42,7 @@ class TrainingCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def camera(self) -> Camera:
-        """Its camera. Raises StageError where the intrinsics make none."""
+        """Its camera. Raises GeometryError where the intrinsics make none."""
         return Camera(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)
 
     @property

@@ -7,9 +7,7 @@ import numpy as np
 from fieldpose.stages.nerf.metadata import Space
 
 
-def normalised(
-    space: Space, origins: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def normalised(space: Space, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Origins and unit directions (n, 3) in the field's coordinates, and the length of the directions there (n,)."""
     o = ((np.asarray(origins, np.float64) - space.centre) / space.scale).astype(np.float32)
     d = np.asarray(directions, np.float64) / space.scale

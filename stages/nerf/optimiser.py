@@ -23,9 +23,7 @@ class Optimiser:
     def __init__(self, net: Net, threads: int):
         self.net = net
         shapes = {name: getattr(net, name).shape for name in LEARNT}
-        self.gradients = [
-            Gradients(**{n: np.zeros(s, np.float32) for n, s in shapes.items()}) for _ in range(threads)
-        ]
+        self.gradients = [Gradients(**{n: np.zeros(s, np.float32) for n, s in shapes.items()}) for _ in range(threads)]
         self._moments = {
             n: (np.zeros(math.prod(s), np.float32), np.zeros(math.prod(s), np.float32)) for n, s in shapes.items()
         }

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from fieldpose.stages.errors import ConfigError
+from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry import Camera, rays
 from fieldpose.stages.nerf.config import Backend
 from fieldpose.stages.nerf.field import Field

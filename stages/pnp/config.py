@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fieldpose.stages.errors import ConfigError
+from fieldpose.errors import ConfigError
 
 
 @dataclass(frozen=True)

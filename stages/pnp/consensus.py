@@ -84,7 +84,11 @@ def agreed_pose(
 
 
 def confirmed_pose(
-    pixels_in_frame: np.ndarray, points: np.ndarray, camera: Camera, weights: np.ndarray, aligner: Aligner,
+    pixels_in_frame: np.ndarray,
+    points: np.ndarray,
+    camera: Camera,
+    weights: np.ndarray,
+    aligner: Aligner,
     config: PnpConfig,
 ) -> Consensus | None:
     """Of the poses that matches agree on, the one at which the most points are found in the frame.

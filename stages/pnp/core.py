@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fieldpose.bus.messages import Reason
 from fieldpose.stages.geometry import Camera, camera_centre, twist_covariance, viewing_angles
 from fieldpose.stages.pnp.alignment import Aligner, Pictures
 from fieldpose.stages.pnp.config import PnpConfig
@@ -19,7 +20,7 @@ _LEAST_CONFIDENCE = 0.01
 
 @dataclass(frozen=True)
 class PnpResult:
-    """ok and a reason that is a value of bus.messages.Reason; where not ok, there is no pose and no inlier.
+    """A pose, what agrees on it, and how certain it is.
 
     inliers: (n,) bool, of the points given.  inliers_in_frame: (m, 2) float32, their pixels as matched, or as found in
     the frame since, and there those of landmarks too.  correspondences: how many points these m were among.
@@ -27,14 +28,12 @@ class PnpResult:
     cam_from_object, in the object's unit and radians.
     """
 
-    ok: bool
-    reason: str
-    cam_from_object: np.ndarray | None
+    cam_from_object: np.ndarray
     inliers: np.ndarray
     inliers_in_frame: np.ndarray
     correspondences: int
-    residual_px: float | None
-    covariance: np.ndarray | None
+    residual_px: float
+    covariance: np.ndarray
 
 
 def solve(
@@ -45,19 +44,19 @@ def solve(
     confidence: np.ndarray | None = None,
     seen_from: np.ndarray | None = None,
     pictures: Pictures | None = None,
-) -> PnpResult:
+) -> PnpResult | Reason:
     """The camera's pose from pixels (n, 2), distorted as the camera has them, and points (n, 3) in the object.
 
     confidence (n,), relative to each other, counts in the refinement and not in RANSAC. pictures: the view that gave
     the points, and the frame; with them all points are looked for anew near where RANSAC's pose puts them, whatever
     they were matched with, and landmarks of the view besides. seen_from (4, 4): where the view was, if there are none;
-    the further it is from the pose found, the less certain is that. The same input gives the same result. Never raises
-    for data that hold no pose: the result says why.
+    the further it is from the pose found, the less certain is that. The same input gives the same result. Data
+    that hold no pose give the reason: TOO_FEW_CONSISTENT_POINTS, NO_CONSENSUS or IMPLAUSIBLE_POSE.
     """
     config = config or PnpConfig()
     count, longer_side = len(pixels_in_frame), max(camera.width, camera.height)
     if count < max(config.min_inliers, MIN_POINTS):
-        return _failed("too_few_consistent_points", count, count)
+        return Reason.TOO_FEW_CONSISTENT_POINTS
     points = points_in_object.astype(np.float64)
     weights = _weights(confidence, count, config)
     if pictures is None or config.align_levels == 0:
@@ -68,7 +67,7 @@ def solve(
         aligner = Aligner(pictures, points, camera, config)
         found = confirmed_pose(pixels_in_frame, points, camera, weights, aligner, config)
     if found is None:
-        return _failed("no_consensus", count, len(points))
+        return Reason.NO_CONSENSUS
     fit, pose = found.fit, found.fit.cam_from_object
     angles = viewing_angles(points[found.index], pose if seen_from is None else seen_from, pose)
     shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles))
@@ -78,11 +77,11 @@ def solve(
     )
     distance = float(np.median(np.linalg.norm(points[found.index] - camera_centre(pose), axis=1)))
     if not _plausible(covariance, found.pixels, longer_side, distance, config):
-        return _failed("implausible_pose", count, found.looked_for)
+        return Reason.IMPLAUSIBLE_POSE
     inliers, in_frame = np.zeros(count, bool), found.pixels.astype(np.float32)
     inliers[found.index[found.index < count]] = True
     rms = float(np.sqrt((residuals**2).sum(axis=1).mean()))
-    return PnpResult(True, "ok", pose, inliers, in_frame, found.looked_for, rms, covariance)
+    return PnpResult(pose, inliers, in_frame, found.looked_for, rms, covariance)
 
 
 def warm_up(config: PnpConfig) -> None:
@@ -92,11 +91,6 @@ def warm_up(config: PnpConfig) -> None:
     points = camera.directions(pixels) * noise.uniform(2, 3, (32, 1)).astype(np.float32)
     image, depth = noise.integers(0, 256, (64, 64, 3), np.uint8), np.full((64, 64), 2.5, np.float32)
     solve(pixels, points, camera, config, pictures=Pictures(image, depth, camera, np.eye(4), image))
-
-
-def _failed(reason: str, count: int, looked_for: int) -> PnpResult:
-    nowhere = np.zeros((0, 2), np.float32)
-    return PnpResult(False, reason, None, np.zeros(count, bool), nowhere, looked_for, None, None)
 
 
 def _weights(confidence: np.ndarray | None, count: int, config: PnpConfig) -> np.ndarray:

@@ -43,6 +43,9 @@ class RefinementConfig:
     shared_error: float = 0.8
     """how far neighbouring pixels err together, as a multiple of their differences in colour"""
 
+    seed: int = 0
+    """Of the choice of pixels."""
+
     @property
     def on(self) -> bool:
         """Whether poses are refined at all."""

@@ -43,18 +43,19 @@ def refine(
     camera: Camera,
     cam_from_object: np.ndarray,
     keypoints_in_frame: np.ndarray,
-    rng: np.random.Generator,
     config: RefinementConfig | None = None,
 ) -> RefinementResult:
     """Refine the pose of a frame (h, w, 3) uint8 whose matched keypoints are given, (n, 2) pixels.
 
-    Returns the pose unchanged, `refined` false, where the refined one is no better or there is nothing to compare.
+    Returns the pose unchanged, `refined` false, where the refined one is no better or there is nothing to compare. The
+    same input gives the same result.
     """
     config = config or RefinementConfig()
     unchanged = RefinementResult(cam_from_object, False, None, None, 0)
     if not config.on:
         return unchanged
     image, camera, keypoints = _shrunk(image, camera, keypoints_in_frame, config.size)
+    rng = np.random.default_rng(config.seed)
     pixels = rng.permutation(_candidates(keypoints, camera, config))
     held_out = min(config.held_out, len(pixels) // 3)
     if held_out < _MIN_PIXELS:

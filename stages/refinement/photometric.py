@@ -86,9 +86,7 @@ class Photometric:
         pulled = pull.reshape(-1, 1) * flat
         return Linearised(self._mean(residuals, weights), pulled.T @ residuals.ravel(), pulled.T @ flat)
 
-    def covariance(
-        self, sample: PixelSample, cam_from_object: np.ndarray, camera: Camera, shared: float
-    ) -> np.ndarray:
+    def covariance(self, sample: PixelSample, cam_from_object: np.ndarray, camera: Camera, shared: float) -> np.ndarray:
         """Covariance (6, 6) of the left twist of a pose that pixels like these were fitted by; see twist_covariance.
 
         shared: how far neighbouring pixels err together, as a multiple of a typical residual.

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fieldpose.bus.messages import Reason
 from fieldpose.stages.geometry import Camera, points_at_depth, viewing_angles
 from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedView
 from fieldpose.stages.rendering.config import RenderingConfig
@@ -34,8 +35,15 @@ class ViewSource:
         self._renderer, self._config, self._field_id = renderer, config or RenderingConfig(), field_id
         self._cache: OrderedDict[str, _Cached] = OrderedDict()
 
-    def view(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool = False) -> SourcedView:
-        """The view of a frame's camera (undistorted, shrunk) at the guess or near it; nearer in a next pass."""
+    def view(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool = False) -> SourcedView | Reason:
+        """The view of a frame's camera (undistorted, shrunk) at the guess or near it; nearer in a next pass.
+
+        NOTHING_IN_VIEW where it shows too little.
+        """
+        found = self._found(camera, cam_from_object, next_pass)
+        return found if found.visible >= self._config.min_visible else Reason.NOTHING_IN_VIEW
+
+    def _found(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool) -> SourcedView:
         small = view_camera(camera, self._config.longer_side)
         view_id = _view_id(self._field_id, small, cam_from_object)
         found = view_id if view_id in self._cache else self._near(small, cam_from_object, next_pass)
@@ -50,20 +58,18 @@ class ViewSource:
 
     def _near(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool) -> str | None:
         """The id of the cached view with the smallest shift among those within the limits."""
-        if self._config.reuse_angle_deg <= 0:
+        if self._config.reuse_within_deg <= 0:
             return None
         share = self._config.next_pass_share if next_pass else 1.0
         best, best_shift = None, share * self._config.reuse_shift
         for view_id, cached in self._cache.items():
             if cached.view.camera == camera:
                 angle_deg, shift = _difference(cached, cam_from_object)
-                if angle_deg <= share * self._config.reuse_angle_deg and shift <= best_shift:
+                if angle_deg <= share * self._config.reuse_within_deg and shift <= best_shift:
                     best, best_shift = view_id, shift
         return best
 
     def _keep(self, view_id: str, cached: _Cached) -> None:
-        if self._config.reuse_angle_deg <= 0:
-            return
         self._cache[view_id] = cached
         while sum(entry.size_bytes for entry in self._cache.values()) > self._config.cache_mb * 2**20:
             self._cache.popitem(last=False)

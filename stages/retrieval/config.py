@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fieldpose.stages.errors import ConfigError
+from fieldpose.errors import ConfigError
 
 _MOST = 256
 """Candidates that fit into a message."""

@@ -7,12 +7,36 @@ been tried on its training images tells how large that is.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from fieldpose.bus.messages import CameraOrigin, TrackingState
 from fieldpose.stages.tracking.distance import Limit
+from fieldpose.stages.tracking.policy import Belief, FrameInfo
 
 _ELSEWHERE_DEG, _ELSEWHERE = 10.0, 0.2
 """So far from where its view was, in degrees or x scale, a pose errs as on any scene."""
+
+
+_UNCALIBRATED = {CameraOrigin.EXIF: (0.03, 0.01), CameraOrigin.ASSUMED: (0.25, 0.1)}
+"""Standard deviations that the camera adds, in shares of the distance and in radians: cameras state their focal length
+in whole millimetres, phones' fields of view lie between 50 and 80 degrees, and photos are cropped."""
+_MOST_SCORE = 0.3
+
+
+def with_camera(belief: Belief, frame: FrameInfo) -> Belief:
+    """A belief that is no surer than the frame's camera; from an assumed camera it is LIMITED at best."""
+    added, pose = _UNCALIBRATED.get(frame.camera_origin), belief.cam_from_object
+    if added is None or pose is None:
+        return belief
+    distance = float(np.linalg.norm(pose[:3, 3]))
+    extra = np.diag([(added[0] * distance) ** 2 / 3] * 3 + [added[1] ** 2 / 3] * 3)
+    covariance = None if belief.covariance is None else belief.covariance + extra
+    if frame.camera_origin is CameraOrigin.EXIF:
+        return replace(belief, covariance=covariance)
+    state = TrackingState.LIMITED if belief.state is TrackingState.TRACKING else belief.state
+    return replace(belief, covariance=covariance, state=state, score=min(belief.score, _MOST_SCORE))
 
 
 class Certainty:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Literal
 
-from fieldpose.stages.errors import ConfigError
+from fieldpose.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -55,8 +55,9 @@ class TrackingConfig:
     guess: str | None = None
     """Where to begin: a JSON file, train:NAME, or perturb:10-40deg,0.2 (each frame's true pose, disturbed); without
     it, training views are tried, those that look like the frame first."""
-    sequence: Literal["video", "photos"] = "video"
-    """Photos have no motion between them: the last pose is the next guess, and no jump is implausible."""
+    sequence: Literal["auto", "video", "photos"] = "auto"
+    """Photos stand each by itself, in videos the motion carries on; auto: by the source, and video where another host
+    has it."""
     depth: int = 2
     """Frames in flight at once."""
     passes: int = 3
@@ -64,9 +65,8 @@ class TrackingConfig:
     retries: int = 1
     """How many other guesses to try on the same frame of a video when one has led nowhere."""
     searches: int = 40
-    """How many training views to try, those that look like it first, then those nearest to the guess, for an image
-    that stands by itself and whose pose was not found from its guess; none where there is only one pass and a guess
-    of its own. Each costs a pass or more."""
+    """How many training views to try, those that look like it first, then those nearest to the guess, for a photo
+    whose pose was not found from its guess; none where there is only one pass. Each costs a pass or more."""
     seed: int = 0
     """Of the disturbed guesses."""
     max_deadline_ms: float = 10_000.0

@@ -6,13 +6,25 @@ received = admitted + dropped + waiting, and admitted = finished + lost + in fli
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fieldpose.bus.messages import Reason
+from fieldpose.stages.tracking.certainty import with_camera
 from fieldpose.stages.tracking.config import TrackingConfig
 from fieldpose.stages.tracking.motion import NS_PER_MS
-from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, Policy, PoseGuess, PoseResult
+from fieldpose.stages.tracking.policy import (
+    Alike,
+    Attempt,
+    Belief,
+    FrameInfo,
+    Look,
+    Policy,
+    PoseGuess,
+    PoseResult,
+    Step,
+)
 
 _LATENCY_SMOOTHING = 0.2
 
@@ -50,7 +62,15 @@ class StateReport:
     counts: Counts
 
 
-Output = GuessOrder | StateReport
+@dataclass(frozen=True)
+class LookOrder:
+    """Say which training views look like this frame."""
+
+    frame: FrameInfo
+    pass_index: int
+
+
+Output = GuessOrder | LookOrder | StateReport
 
 
 class Tracker:
@@ -92,44 +112,70 @@ class Tracker:
         self._waiting = (frame, now_ns)
         return self._admit(now_ns)
 
-    def on_truth(self, frame_id: int, cam_from_object: np.ndarray | None, now_ns: int) -> list[Output]:
-        """Take in the true pose of a frame; it may come before the frame or after."""
-        self._policy.on_truth(frame_id, cam_from_object)
+    def on_prior(self, frame_id: int, cam_from_object: np.ndarray, now_ns: int) -> list[Output]:
+        """Take in a guess of a frame's pose from outside; it may come before the frame or after."""
+        self._policy.on_prior(frame_id, cam_from_object)
         return self._admit(now_ns)
 
-    def on_pose(self, result: PoseResult, now_ns: int) -> list[Output]:
+    def on_alike(self, frame_id: int, alike: Alike, now_ns: int) -> list[Output]:
+        """Take in the answer to a Look; one that nobody waits for any more is late and changes nothing."""
+        attempt = self._in_flight.get(frame_id)
+        if attempt is None or not attempt.looking:
+            self._late += 1
+            return []
+        guess = self._policy.after_look(attempt, alike)
+        if guess is not None:
+            return [self._take_step(attempt, guess, now_ns)]
+        nothing = PoseResult(frame_id, max(attempt.pass_index, 0), reason=alike.reason or Reason.NOTHING_ALIKE)
+        return self._finish(attempt, nothing, now_ns)
+
+    def on_result(self, result: PoseResult, now_ns: int) -> list[Output]:
         """Take in a result; one that is not of a frame's present pass is late and changes nothing."""
         attempt = self._in_flight.get(result.frame_id)
-        if attempt is None or attempt.pass_index != result.pass_index:
+        if attempt is None or attempt.looking or attempt.pass_index != result.pass_index:
             self._late += 1
             return []
         self._note_latency(now_ns - attempt.sent_ns)
-        guess = self._policy.next_guess(attempt, result)
-        if guess is not None:
-            attempt = self._in_flight[result.frame_id] = attempt.again(guess, now_ns)
-            return [GuessOrder(attempt.frame, attempt.pass_index, guess)]
-        del self._in_flight[result.frame_id]
-        self._finished += 1
-        belief = self._policy.conclude(attempt, result)
-        return [*self._admit(now_ns), self._report(attempt.frame, result.pass_index, belief)]
+        step = self._policy.next_step(attempt, result)
+        if step is not None:
+            return [self._take_step(attempt, step, now_ns)]
+        return self._finish(attempt, result, now_ns)
 
     def on_tick(self, now_ns: int) -> list[Output]:
-        """Give up what is past its deadline; call it often."""
+        """Give up what is past its deadline, and go on without an answer to a Look that is; call it often."""
         late = [a for a in self._in_flight.values() if now_ns - a.sent_ns > self.deadline_ms * NS_PER_MS]
-        reports: list[Output] = [self._give_up(attempt, now_ns) for attempt in late]
-        return [*self._admit(now_ns), *reports, *self._turn_away(now_ns)]
+        outputs: list[Output] = []
+        for attempt in late:
+            if attempt.looking:
+                outputs += self.on_alike(attempt.frame.frame_id, Alike(reason=Reason.NO_ANSWER), now_ns)
+            else:
+                outputs.append(self._give_up(attempt, now_ns))
+        return [*self._admit(now_ns), *outputs, *self._turn_away(now_ns)]
 
     def _admit(self, now_ns: int) -> list[Output]:
         if self._waiting is None or self._full():
             return []
         frame, _ = self._waiting
-        guess = self._policy.first_guess(frame)
-        if guess is None:
+        step = self._policy.first_step(frame)
+        if step is None:
             return []
         self._waiting = None
         self._admitted += 1
-        self._in_flight[frame.frame_id] = Attempt(frame, guess, now_ns)
-        return [GuessOrder(frame, 0, guess)]
+        return [self._take_step(Attempt(frame, now_ns), step, now_ns)]
+
+    def _take_step(self, attempt: Attempt, step: Step, now_ns: int) -> GuessOrder | LookOrder:
+        frame_id = attempt.frame.frame_id
+        if isinstance(step, Look):
+            self._in_flight[frame_id] = replace(attempt, looking=True, sent_ns=now_ns)
+            return LookOrder(attempt.frame, max(attempt.pass_index, 0))
+        attempt = self._in_flight[frame_id] = attempt.again(step, now_ns)
+        return GuessOrder(attempt.frame, attempt.pass_index, step)
+
+    def _finish(self, attempt: Attempt, result: PoseResult, now_ns: int) -> list[Output]:
+        del self._in_flight[attempt.frame.frame_id]
+        self._finished += 1
+        belief = self._policy.conclude(attempt, result)
+        return [*self._admit(now_ns), self._report(attempt.frame, result.pass_index, belief)]
 
     def _full(self) -> bool:
         """No place is free, or the waiting frame's number is still in flight (a camera that began again)."""
@@ -145,13 +191,14 @@ class Tracker:
             return []
         self._waiting = None
         self._dropped += 1
-        return [self._report(frame, 0, self._policy.missed(frame))]
+        return [self._report(frame, 0, self._policy.missed(frame, Reason.NO_GUESS))]
 
     def _give_up(self, attempt: Attempt, now_ns: int) -> StateReport:
         del self._in_flight[attempt.frame.frame_id]
         self._lost += 1
         self._note_latency(now_ns - attempt.sent_ns)  # or a pipeline that became slow would stay late for ever
-        return self._report(attempt.frame, attempt.pass_index, self._policy.missed(attempt.frame))
+        belief = self._policy.missed(attempt.frame, Reason.NO_ANSWER)
+        return self._report(attempt.frame, max(attempt.pass_index, 0), belief)
 
     def _note_latency(self, latency_ns: int) -> None:
         latency_ms = latency_ns / NS_PER_MS
@@ -159,4 +206,4 @@ class Tracker:
         self._latency_ms = usual + _LATENCY_SMOOTHING * (latency_ms - usual)
 
     def _report(self, frame: FrameInfo, pass_index: int, belief: Belief) -> StateReport:
-        return StateReport(frame, pass_index, belief, self.counts)
+        return StateReport(frame, pass_index, with_camera(belief, frame), self.counts)

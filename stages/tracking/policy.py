@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
-from fieldpose.bus.messages import GuessReason, TrackingState
+from fieldpose.bus.messages import CameraOrigin, GuessReason, Reason, TrackingState
+from fieldpose.stages.geometry import Camera
 
 
 @dataclass(frozen=True)
 class FrameInfo:
-    """A camera frame without its pixels; `camera` is only carried along."""
+    """A camera frame without its pixels."""
 
     frame_id: int
     capture_ns: int
-    camera: Any = None
+    camera: Camera
+    camera_origin: CameraOrigin = CameraOrigin.CALIBRATED
 
 
 @dataclass(frozen=True)
@@ -29,32 +32,51 @@ class PoseGuess:
 
 
 @dataclass(frozen=True)
+class Look:
+    """Ask which training views look like the frame, before anything is rendered."""
+
+
+@dataclass(frozen=True)
+class Alike:
+    """cam_from_object (4, 4) of training views that look like a frame, the most alike first, or why there are none."""
+
+    poses: Sequence[np.ndarray] = ()
+    reason: Reason | None = None
+
+
+@dataclass(frozen=True)
 class PoseResult:
-    """What came back for a pass over a frame."""
+    """What came back for a pass over a frame: a pose, or the reason why there is none."""
 
     frame_id: int
     pass_index: int
-    ok: bool
     cam_from_object: np.ndarray | None = None
     covariance: np.ndarray | None = None
     inliers: int = 0
     correspondences: int = 0
     residual_px: float | None = None
+    reason: Reason | None = None
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """A frame in flight.
+    """A frame in flight, with the guess of its present pass; None before the first.
 
-    pass_index counts all its passes, `passes` those since a fresh guess.
+    pass_index counts all its passes, `passes` those since a fresh guess. looking: an answer to a Look is awaited.
     """
 
     frame: FrameInfo
-    guess: PoseGuess
     sent_ns: int
-    pass_index: int = 0
-    passes: int = 1
-    retries: int = 0
+    guess: PoseGuess | None = None
+    looking: bool = False
+    pass_index: int = -1
+    passes: int = 0
+    retries: int = -1
+
+    @property
+    def epoch(self) -> int:
+        """That of its guess; of none, -1."""
+        return -1 if self.guess is None else self.guess.epoch
 
     def again(self, guess: PoseGuess, now_ns: int) -> Attempt:
         """The next pass over this frame."""
@@ -63,6 +85,7 @@ class Attempt:
             self,
             guess=guess,
             sent_ns=now_ns,
+            looking=False,
             pass_index=self.pass_index + 1,
             passes=self.passes + 1 if carried_on else 1,
             retries=self.retries if carried_on else self.retries + 1,
@@ -71,33 +94,42 @@ class Attempt:
 
 @dataclass(frozen=True)
 class Belief:
-    """Where the camera is believed to be at a frame's capture time; no pose where nothing is believed."""
+    """Where the camera is believed to be at a frame's capture time, or why nothing is believed of it."""
 
     state: TrackingState
     score: float
     cam_from_object: np.ndarray | None = None
     covariance: np.ndarray | None = None
+    reason: Reason | None = None
+
+
+Step = PoseGuess | Look
+"""What is to be done next for a frame."""
 
 
 class Policy(Protocol):
     """Makes the guesses and judges the results; the Tracker keeps the door and the clock."""
 
-    def on_truth(self, frame_id: int, cam_from_object: np.ndarray | None) -> None:
-        """A frame's true pose has become known; None where the object is out of view."""
+    def on_prior(self, frame_id: int, cam_from_object: np.ndarray) -> None:
+        """A guess of a frame's pose has come from outside, before the frame or after."""
         ...
 
-    def first_guess(self, frame: FrameInfo) -> PoseGuess | None:
-        """The guess for a new frame; None while it is not known yet."""
+    def first_step(self, frame: FrameInfo) -> Step | None:
+        """What to do for a new frame; None while it waits for its prior."""
         ...
 
-    def next_guess(self, attempt: Attempt, result: PoseResult) -> PoseGuess | None:
-        """The guess for another pass over the same frame; None when its result is final."""
+    def after_look(self, attempt: Attempt, alike: Alike) -> PoseGuess | None:
+        """The guess once it is known which training views look like the frame; None where there is none to try."""
+        ...
+
+    def next_step(self, attempt: Attempt, result: PoseResult) -> Step | None:
+        """What to do for another pass over the same frame; None when its result is final."""
         ...
 
     def conclude(self, attempt: Attempt, result: PoseResult) -> Belief:
         """What is believed after a frame's last pass."""
         ...
 
-    def missed(self, frame: FrameInfo) -> Belief:
+    def missed(self, frame: FrameInfo, reason: Reason) -> Belief:
         """What is believed about a frame that has no result: lost on its way, or without a guess."""
         ...

@@ -11,7 +11,7 @@ from fieldpose.stages.tracking.policy import PoseResult
 
 def score(result: PoseResult, config: ScoreConfig, scale: float = 1.0) -> float:
     """0 (no pose, or one not to be used) to 1 (nothing to complain of): the weakest of its measures."""
-    if not result.ok or result.cam_from_object is None or result.inliers < config.min_inliers:
+    if result.cam_from_object is None or result.inliers < config.min_inliers:
         return 0.0
     measures = [
         result.inliers / max(config.good_inliers, 1),

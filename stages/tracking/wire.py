@@ -6,70 +6,77 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from fieldpose.bus.messages import Frame, Guess, Pose, State
+from fieldpose.bus.messages import CameraInfo, Failure, Guess, Pose, Reason, Retrieved, Search, State
 from fieldpose.bus.node import Output, first_header
-from fieldpose.bus.topics import GUESS, STATE
+from fieldpose.bus.topics import GUESS, SEARCH, STATE
 from fieldpose.stages.geometry import is_rigid
 from fieldpose.stages.tracking import core
-from fieldpose.stages.tracking.policy import FrameInfo, PoseResult
+from fieldpose.stages.tracking.policy import Alike, FrameInfo, PoseResult
 
 _RIGID_TOLERANCE = 1e-3
 
 
-def frame_info(frame: Frame) -> FrameInfo:
-    """What the Tracker needs of a Frame message."""
-    return FrameInfo(frame.header.frame_id, frame.header.capture_ns, frame.camera)
+def frame_info(message: CameraInfo) -> FrameInfo:
+    """What the Tracker needs of a frame."""
+    header = message.header
+    return FrameInfo(header.frame_id, header.capture_ns, message.camera, message.camera_origin)
 
 
 def pose_result(pose: Pose) -> PoseResult:
     """What the Tracker needs of a Pose message; a pose that is no rigid transform is a failure."""
-    matrix = copied(pose.cam_from_object)
+    header, matrix = pose.header, copied(pose.cam_from_object)
+    if not is_rigid(matrix, _RIGID_TOLERANCE):
+        return PoseResult(header.frame_id, header.pass_index, reason=Reason.IMPLAUSIBLE_POSE)
     return PoseResult(
-        frame_id=pose.header.frame_id,
-        pass_index=pose.header.pass_index,
-        ok=pose.ok and matrix is not None and is_rigid(matrix, _RIGID_TOLERANCE),
-        cam_from_object=matrix,
-        covariance=copied(pose.covariance),
-        inliers=pose.inliers,
-        correspondences=pose.correspondences,
-        residual_px=pose.residual_px,
-    )
+        header.frame_id, header.pass_index, matrix, copied(pose.covariance), pose.inliers, pose.correspondences,
+        pose.residual_px,
+    )  # fmt: skip
 
 
-def copied(array: np.ndarray | None) -> np.ndarray | None:
+def failed(failure: Failure) -> PoseResult:
+    """A pass without a pose."""
+    return PoseResult(failure.header.frame_id, failure.header.pass_index, reason=failure.reason)
+
+
+def alike(message: Retrieved | Failure) -> Alike:
+    """What retrieval has found, or why it has not."""
+    if isinstance(message, Failure):
+        return Alike(reason=message.reason)
+    return Alike(list(copied(message.cam_from_object)))
+
+
+def copied(array: np.ndarray) -> np.ndarray:
     """An array of its own: one of a message is a view of all its bytes, read-only and maybe unaligned."""
-    return None if array is None else np.array(array, dtype=np.float64)
+    return np.array(array, dtype=np.float64)
 
 
 def outputs_of(outputs: Iterable[core.Output]) -> Iterator[Output]:
     """The messages that say what the Tracker wants said."""
     for output in outputs:
         header = first_header(output.frame.frame_id, output.frame.capture_ns, output.pass_index)
-        if isinstance(output, core.GuessOrder):
-            guess = output.guess
-            yield (
-                GUESS,
-                Guess(
-                    header=header,
-                    reason=guess.reason,
-                    cam_from_object=guess.cam_from_object,
-                    camera=output.frame.camera,
-                ),
-            )
-            continue
-        belief, counts = output.belief, output.counts
-        yield (
-            STATE,
-            State(
-                header=header,
-                state=belief.state,
-                score=belief.score,
-                cam_from_object=belief.cam_from_object,
-                covariance=belief.covariance,
-                in_flight=counts.in_flight,
-                admitted=counts.admitted,
-                finished=counts.finished,
-                dropped_at_the_door=counts.dropped_at_the_door,
-                lost=counts.lost,
-            ),
-        )
+        match output:
+            case core.LookOrder():
+                yield SEARCH, Search(header=header)
+            case core.GuessOrder(frame=frame, guess=guess):
+                pose = guess.cam_from_object
+                yield GUESS, Guess(header=header, reason=guess.reason, cam_from_object=pose, camera=frame.camera)
+            case core.StateReport():
+                yield STATE, _state(output)
+
+
+def _state(report: core.StateReport) -> State:
+    belief, counts, frame = report.belief, report.counts, report.frame
+    return State(
+        header=first_header(frame.frame_id, frame.capture_ns, report.pass_index),
+        state=belief.state,
+        score=belief.score,
+        cam_from_object=belief.cam_from_object,
+        covariance=belief.covariance,
+        reason=belief.reason,
+        camera_origin=frame.camera_origin,
+        in_flight=counts.in_flight,
+        admitted=counts.admitted,
+        finished=counts.finished,
+        dropped_at_the_door=counts.dropped_at_the_door,
+        lost=counts.lost,
+    )

@@ -17,9 +17,9 @@ from support.bus_samples import every_message, frame, guess, matches, same, view
 
 from fieldpose.bus import messages, topics
 from fieldpose.bus.codec import DTYPES, decode, encode
-from fieldpose.bus.errors import CodecError
 from fieldpose.bus.messages import Message
 from fieldpose.bus.topics import Topic
+from fieldpose.errors import CodecError
 
 SAMPLES = every_message()
 PAYLOADS = {topic: encode(message) for topic, message in SAMPLES.items()}

@@ -9,14 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldpose.bus.codec import decode_header, encode
-from fieldpose.bus.errors import CodecError
-from fieldpose.bus.messages import CameraModel, Frame, Header, Truth
+from fieldpose.bus.messages import Camera, Frame, Header, Truth
+from fieldpose.errors import CodecError
 
 HEADER = Header("camera", 3, 17, 0, 123, 456)
 
 
 def test_header_of_a_large_message_is_had_without_the_rest() -> None:
-    camera = CameraModel(64, 48, 50.0, 50.0, 31.5, 23.5)
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
     frame = Frame(header=HEADER, image=np.zeros((48, 64, 3), np.uint8), encoding="rgb8", camera=camera)
     payload = encode(frame)
     assert decode_header(payload) == HEADER

@@ -7,12 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.bus_samples import ADDRESS, frame, guess, truth, view
 
-from fieldpose.bus.errors import CodecError
 from fieldpose.bus.joining import Joiner
 from fieldpose.bus.messages import Header
 from fieldpose.bus.ports import Inbox, Outbox, Sequences, reply_header
 from fieldpose.bus.topics import FRAME, GUESS, TRUTH, VIEW, Topic
 from fieldpose.bus.transport import MemoryBus
+from fieldpose.errors import CodecError
 
 SECOND_NS = 10**9
 

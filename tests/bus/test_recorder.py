@@ -15,13 +15,13 @@ from mcap.reader import make_reader
 from support.bus_samples import ADDRESS, every_message, frame, guess, same, truth
 
 from fieldpose.bus.codec import encode
-from fieldpose.bus.errors import RecordingError
 from fieldpose.bus.messages import Header
 from fieldpose.bus.ports import Inbox, Outbox
 from fieldpose.bus.recorder import RECORDED, Recorder, RecorderHandler, RecordingWriter, partial_path, recover
 from fieldpose.bus.replay import Attachment, info, read_recording
 from fieldpose.bus.topics import ALL, FRAME, GUESS, STATS, TRUTH, Address
 from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus, wait_for
+from fieldpose.errors import RecordingError
 
 Connect = Callable[[str], ZenohBus]
 Spawn = Callable[..., "subprocess.Popen[str]"]

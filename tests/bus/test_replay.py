@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.bus_samples import ADDRESS, frame, guess, same, truth
 
-from fieldpose.bus.errors import RecordingError
 from fieldpose.bus.messages import Header
 from fieldpose.bus.ports import Inbox
 from fieldpose.bus.recorder import RecordingWriter, recover
 from fieldpose.bus.replay import Attachment, info, read_attachment, read_recording, replay
 from fieldpose.bus.topics import FRAME, GUESS, TRUTH, Address
 from fieldpose.bus.transport import MemoryBus
+from fieldpose.errors import RecordingError
 
 SECOND_NS = 10**9
 

@@ -14,10 +14,10 @@ from typing import TypeVar
 import pytest
 from support.bus_samples import ADDRESS, frame, guess, same, truth
 
-from fieldpose.bus.errors import TransportError
 from fieldpose.bus.ports import Inbox, Outbox
 from fieldpose.bus.topics import FRAME, GUESS, STATS, TRUTH, Address
 from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus, serve_hub, wait_for
+from fieldpose.errors import TransportError
 
 T = TypeVar("T")
 

@@ -13,7 +13,7 @@ from fieldpose.deploy.local import PoseFinder
 from fieldpose.deploy.settings import Settings, changed
 from fieldpose.stages.geometry import perturb
 from fieldpose.stages.nerf.metadata import PoseAccuracy
-from fieldpose.stages.tracking.views import TrainingViews
+from fieldpose.stages.nerf.training_views import TrainingViews
 
 SETTINGS = changed(Settings(), {"matching": {"matcher": "sift"}}, "test")
 SEEN_BY = camera(160)

@@ -15,7 +15,7 @@ from support.commands import fieldpose, save_empty_field
 
 from fieldpose.deploy.cli import COMMANDS, main, parse
 from fieldpose.deploy.commands import run, stage
-from fieldpose.deploy.errors import UsageError
+from fieldpose.errors import UsageError
 
 
 @pytest.fixture

@@ -6,8 +6,8 @@ import socket
 
 import pytest
 
-from fieldpose.bus.errors import TransportError
 from fieldpose.deploy.processes.endpoints import check_free, free_port, peer_address
+from fieldpose.errors import TransportError
 
 
 @pytest.mark.parametrize("hub", ["tcp/127.0.0.1:7447", "tcp/localhost:1", "tls/[::1]:7447"])

@@ -13,7 +13,7 @@ from support.posed_images import centred, write_blender
 
 from fieldpose.deploy.evaluation.occlusion import Occlusion, objects_of, occluded, painted
 from fieldpose.deploy.scene import demo_file
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets import load_dataset
 
 GREY = np.full((120, 160, 3), 99, np.uint8)

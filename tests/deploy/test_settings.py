@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fieldpose.deploy.settings import Settings, changed, read_file, read_settings, to_json
-from fieldpose.stages.errors import ConfigError
+from fieldpose.errors import ConfigError
 
 
 def written(path: Path, text: str) -> Path:

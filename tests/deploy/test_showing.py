@@ -13,11 +13,11 @@ from support.chain import frame_message
 from fieldpose.bus.messages import Header
 from fieldpose.bus.recording import RecordingWriter
 from fieldpose.bus.topics import FRAME, Address
-from fieldpose.deploy.errors import OutputError
 from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
 from fieldpose.deploy.reporting.overlay import EDGE_RGB, encoded, overlaid
 from fieldpose.deploy.reporting.results import FrameResult, TruthKnown
 from fieldpose.deploy.reporting.showing import pictures, write_video
+from fieldpose.errors import OutputError
 from fieldpose.stages.geometry import perturb
 
 CAMERA = camera(64)

@@ -13,8 +13,8 @@ from pathlib import Path
 import psutil
 import pytest
 
-from fieldpose.deploy.errors import ProcessError
 from fieldpose.deploy.processes.supervision import USER_ERROR, Program, Supervisor
+from fieldpose.errors import ProcessError
 
 SLEEP = "import time; print('up', flush=True); time.sleep(60)"
 STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); {SLEEP}"

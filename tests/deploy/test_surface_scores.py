@@ -9,7 +9,7 @@ import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
 from fieldpose.deploy.evaluation.surface import Surface, add, add_s, area_under_curve, read_surface, surface_of
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry import camera_centre, look_at, rotation_about
 from fieldpose.stages.nerf.metadata import TrainingCamera
 

@@ -10,7 +10,7 @@ from support import posed_images
 from support.pictures import needs
 
 from fieldpose.deploy.cli import main
-from fieldpose.stages.errors import WeightsError
+from fieldpose.errors import WeightsError
 from fieldpose.stages.nerf.field import load_field
 from fieldpose.stages.nerf.metadata import PoseAccuracy
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from fieldpose.bus import topics
 from fieldpose.bus.messages import (
-    CameraModel,
+    Camera,
     Correspondences,
     Estimate,
     Frame,
@@ -30,7 +30,7 @@ from fieldpose.bus.ports import first_header
 from fieldpose.bus.topics import Address, Topic
 
 ADDRESS = Address("test", "mug", "cam")
-CAMERA = CameraModel(6, 4, 5.0, 5.0, 2.5, 1.5, (0.1, 0.0, 0.0, 0.0, -0.2))
+CAMERA = Camera(6, 4, 5.0, 5.0, 2.5, 1.5, (0.1, 0.0, 0.0, 0.0, -0.2))
 
 
 def pixels(count: int, columns: int = 2) -> np.ndarray:
@@ -43,7 +43,7 @@ def scores(count: int) -> np.ndarray:
 
 def frame(frame_id: int = 0, width: int = 6, height: int = 4, header: Header | None = None) -> Frame:
     image = np.random.default_rng(frame_id).integers(0, 256, (height, width, 3), dtype=np.uint8)
-    camera = CameraModel(width, height, 5.0, 5.0, 2.5, 1.5)
+    camera = Camera(width, height, 5.0, 5.0, 2.5, 1.5)
     return Frame(header=header or first_header(frame_id, 1000 + frame_id), image=image, encoding="rgb8", camera=camera)
 
 

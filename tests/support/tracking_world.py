@@ -6,19 +6,28 @@ import heapq
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
-from fieldpose.bus.messages import GuessReason, TrackingState
-from fieldpose.stages.geometry import exp_se3, look_at, perturb, rotation_error_deg, translation_error
-from fieldpose.stages.tracking.core import GuessOrder, StateReport, Tracker
-from fieldpose.stages.tracking.distance import Limit
-from fieldpose.stages.tracking.policy import FrameInfo, PoseResult
-from fieldpose.stages.tracking.views import TrainingViews
+from fieldpose.bus.messages import CameraOrigin, GuessReason, Reason, TrackingState
+from fieldpose.stages.geometry import Camera, exp_se3, look_at, perturb, rotation_error_deg, translation_error
+from fieldpose.stages.nerf.training_views import TrainingViews
+from fieldpose.stages.tracking.core import GuessOrder, LookOrder, Output, StateReport, Tracker
+from fieldpose.stages.tracking.distance import Limit, pairwise
+from fieldpose.stages.tracking.policy import Alike, FrameInfo, PoseResult
 
 MS = 1_000_000
 FRAME_MS = 1000 / 30
+CAMERA = Camera(640, 480, 600.0, 600.0, 319.5, 239.5)
 Path = Callable[[float], "np.ndarray | None"]
+Retrieval = Callable[[FrameInfo], "Alike | None"]
+
+
+def frame_info(
+    frame_id: int = 0, capture_ns: int = 0, origin: CameraOrigin = CameraOrigin.CALIBRATED
+) -> FrameInfo:  # fmt: skip
+    return FrameInfo(frame_id, capture_ns, CAMERA, origin)
 
 
 def on_sphere(azimuth_deg: float, elevation_deg: float, radius: float = 4.0) -> np.ndarray:
@@ -43,7 +52,7 @@ class World:
 
     The pipeline finds the pose if the guess is within its basin, with an error that grows with the guess's, and
     otherwise fails or, one time in five, finds nonsense with few inliers. One pass takes `service_ms` in a pipeline
-    of which `latency_ms` is the whole length.
+    of which `latency_ms` is the whole length. `retrieval` answers a Look after `look_ms`, or never where it says None.
     """
 
     tracker: Tracker
@@ -53,28 +62,38 @@ class World:
     loses: float = 0.0
     seed: int = 0
     distort: Callable[[int, PoseResult], PoseResult] = lambda frame_id, result: result
+    retrieval: Retrieval = lambda frame: Alike(reason=Reason.NOT_AVAILABLE)
+    look_ms: float = 20.0
+    origin: CameraOrigin = CameraOrigin.CALIBRATED
     guesses: list[GuessOrder] = field(default_factory=list)
+    looks: list[LookOrder] = field(default_factory=list)
     reports: list[StateReport] = field(default_factory=list)
 
     def run(self, seconds: float) -> World:
         rng = np.random.default_rng(self.seed)
-        pending: list[tuple[int, int, PoseResult]] = []
+        pending: list[tuple[int, int, Callable[[int], list[Output]]]] = []
         order, busy_until, frames = itertools.count(), 0, 0
         for now_ns in range(0, int(seconds * 1e9), 5 * MS):
             outputs = self.tracker.on_tick(now_ns)
             if now_ns >= frames * FRAME_MS * MS:
-                outputs += self.tracker.on_frame(FrameInfo(frames, now_ns), now_ns)
+                outputs += self.tracker.on_frame(frame_info(frames, now_ns, self.origin), now_ns)
                 frames += 1
             while pending and pending[0][0] <= now_ns:
-                outputs += self.tracker.on_pose(heapq.heappop(pending)[2], now_ns)
+                outputs += heapq.heappop(pending)[2](now_ns)
             self.reports += [output for output in outputs if isinstance(output, StateReport)]
+            for look in (output for output in outputs if isinstance(output, LookOrder)):
+                self.looks.append(look)
+                alike = self.retrieval(look.frame)
+                if alike is not None:
+                    reply = partial(self.tracker.on_alike, look.frame.frame_id, alike)
+                    heapq.heappush(pending, (now_ns + int(self.look_ms * MS), next(order), reply))
             for guess in (output for output in outputs if isinstance(output, GuessOrder)):
                 self.guesses.append(guess)
                 busy_until = max(busy_until, now_ns) + int(self.service_ms * MS)
                 done = max(busy_until, now_ns + int(self.latency_ms(rng) * MS))
                 if rng.random() >= self.loses:
                     result = self.distort(guess.frame.frame_id, self._solve(guess, rng))
-                    heapq.heappush(pending, (done, next(order), result))
+                    heapq.heappush(pending, (done, next(order), partial(self.tracker.on_result, result)))
         return self
 
     def _solve(self, order: GuessOrder, rng: np.random.Generator) -> PoseResult:
@@ -84,10 +103,10 @@ class World:
         if off < 1.0 and truth is not None:
             error = 0.005 * rng.standard_normal(6) * (0.3 + off)
             covariance = np.diag([1e-4] * 3 + [1e-5] * 3)
-            return PoseResult(*ids, True, exp_se3(error) @ truth, covariance, int(150 * (1.2 - off)), 200, 1.0)
+            return PoseResult(*ids, exp_se3(error) @ truth, covariance, int(150 * (1.2 - off)), 200, 1.0)
         if rng.random() < 0.2:
-            return PoseResult(*ids, True, perturb(guess, rng, (20, 90), 1.0), None, int(rng.integers(6, 15)), 120, 3.0)
-        return PoseResult(*ids, False)
+            return PoseResult(*ids, perturb(guess, rng, (20, 90), 1.0), None, int(rng.integers(6, 15)), 120, 3.0)
+        return PoseResult(*ids, reason=Reason.NO_CONSENSUS)
 
     def states(self, since_s: float = 0.0, until_s: float = 1e9) -> list[TrackingState]:
         return [r.belief.state for r in self.between(since_s, until_s)]
@@ -110,3 +129,16 @@ def ring_of_views() -> TrainingViews:
     """72 training views on the upper half of a sphere."""
     poses = [on_sphere(azimuth, elevation) for elevation in (10, 35, 60) for azimuth in range(0, 360, 15)]
     return TrainingViews(tuple(f"train/r_{i}.png" for i in range(len(poses))), np.stack(poses))
+
+
+def most_alike(views: TrainingViews, path: Path, count: int = 3) -> Retrieval:
+    """A retrieval that is right: the training views nearest to the truth, none where the object is out of view."""
+
+    def retrieval(frame: FrameInfo) -> Alike:
+        truth = path(frame.capture_ns * 1e-9)
+        if truth is None:
+            return Alike(reason=Reason.NOTHING_ALIKE)
+        distances = pairwise(truth[None], views.cam_from_object, Limit(35.0, 2.5))[0]
+        return Alike(list(views.cam_from_object[np.argsort(distances, kind="stable")[:count]]))
+
+    return retrieval

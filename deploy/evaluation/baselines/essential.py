@@ -12,6 +12,7 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
+from fieldpose.bus.messages import Reason
 from fieldpose.deploy.settings import Settings
 from fieldpose.stages.geometry import Camera, camera_centre
 from fieldpose.stages.geometry.rigid import from_rotation
@@ -46,7 +47,6 @@ class Essential:
         # A view from near the guess would do for the rotation, but not for the direction from the guess.
         self._views = ViewSource(renderer, replace(settings.rendering, reuse_angle_deg=0.0))
         self._matcher = PairMatcher(build_matcher(settings.matching), settings.matching)
-        self._min_matches = max(_LEAST, settings.matching.min_matches)
 
     def find(self, image: np.ndarray, camera: Camera, guess: np.ndarray) -> np.ndarray | None:
         """cam_from_object (4, 4) of an image (h, w, 3) uint8 whose rotation alone counts; None if there is none."""
@@ -55,9 +55,12 @@ class Essential:
 
     def relative(self, image: np.ndarray, camera: Camera, guess: np.ndarray) -> EssentialFound | None:
         """What find() tells, and in which direction the camera moved."""
-        view = self._views.view(camera, guess).view
+        sourced = self._views.view(camera, guess)
+        if isinstance(sourced, Reason):
+            return None
+        view = sourced.view
         matched = self._matcher.match(view.rgb, view.opacity, image)
-        if len(matched.confidence) < self._min_matches:
+        if isinstance(matched, Reason) or len(matched.confidence) < _LEAST:
             return None
         moved = _frame_from_view(matched, view.camera, camera)
         if moved is None:

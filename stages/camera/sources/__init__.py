@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from fieldpose.errors import SourceError
+from fieldpose.stages.camera.calibration import Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import Source
 from fieldpose.stages.camera.sources.dataset import open_dataset
@@ -12,13 +14,13 @@ from fieldpose.stages.camera.sources.device import open_device
 from fieldpose.stages.camera.sources.folder import open_folder
 from fieldpose.stages.camera.sources.recording import open_recording
 from fieldpose.stages.camera.sources.video import open_video
-from fieldpose.stages.errors import SourceError
+from fieldpose.stages.geometry import Camera
 
 
 class Kind(NamedTuple):
     """How to open a source, given what stands after the colon; is_video: its frames follow one another in time."""
 
-    open: Callable[[str, CameraConfig], Source]
+    open: Callable[[str, CameraConfig, Calibrator], Source]
     example: str
     is_video: bool
 
@@ -32,10 +34,10 @@ KINDS: dict[str, Kind] = {
 }
 
 
-def open_source(config: CameraConfig) -> Source:
-    """Open config.source. Raises SourceError or another StageError, in one line."""
+def open_source(config: CameraConfig, known: Sequence[Camera] = ()) -> Source:
+    """Open config.source; `known` are cameras of training views. Raises SourceError or another FieldposeError."""
     kind, rest = _parse(config.source)
-    return kind.open(rest, config)
+    return kind.open(rest, config, Calibrator(config, known))
 
 
 def is_video(source: str) -> bool:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 import cv2
 
-from fieldpose.stages.errors import SourceError
+from fieldpose.errors import SourceError
 
 _FFMPEG_QUIET = "-8"
 

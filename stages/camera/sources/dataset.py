@@ -6,15 +6,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import cast, get_args
 
+from fieldpose.errors import SourceError
+from fieldpose.stages.camera.calibration import Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source, TruePose
-from fieldpose.stages.errors import SourceError
 from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.nerf.datasets.assemble import Split
 
 
-def open_dataset(rest: str, config: CameraConfig) -> Source:
-    """dataset:DIR:SPLIT. Raises SourceError for an unknown split, DatasetError for an unusable dataset."""
+def open_dataset(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
+    """dataset:DIR:SPLIT, which knows its cameras. Raises SourceError for an unknown split, and DatasetError."""
     root, split = _parse(rest)
     dataset = load_dataset(root, split, config.size, holdout=config.holdout)
 

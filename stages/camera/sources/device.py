@@ -8,29 +8,29 @@ from contextlib import contextmanager
 
 import cv2
 
-from fieldpose.stages.camera.calibration import calibrate, shrunk
+from fieldpose.errors import SourceError
+from fieldpose.stages.camera.calibration import Calibration, Calibrator, shrunk
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.camera.sources.capture import opened
-from fieldpose.stages.errors import SourceError
-from fieldpose.stages.geometry import Camera
 
 
-def open_device(rest: str, config: CameraConfig) -> Source:
+def open_device(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
     """camera:NUMBER or camera:PATH of a device. Raises SourceError if it cannot be opened or gives no frame."""
     with _capture(rest) as capture:
         read, image = capture.read()
         if not read:
             raise SourceError(f"camera:{rest}: opened, but gives no frame; does another program use it?")
-    calibration = calibrate(config, image.shape[1], image.shape[0])
+    calibration = calibrator.of(image.shape[1], image.shape[0])
 
     def frames(first: int) -> Iterator[CapturedFrame]:
-        return _frames(rest, first, calibration.camera, config.size)
+        return _frames(rest, first, calibration, config.size)
 
-    return Source(f"camera {rest}, {calibration.origin}", "wall", frames)
+    return Source(f"camera {rest}, {calibration.told}", "wall", frames)
 
 
-def _frames(device: str, frame_id: int, camera: Camera, size: int | None) -> Iterator[CapturedFrame]:
+def _frames(device: str, frame_id: int, calibration: Calibration, size: int | None) -> Iterator[CapturedFrame]:
+    camera, origin = calibration.camera, calibration.origin
     with _capture(device) as capture:
         while capture.grab():
             at_ns = time.time_ns()
@@ -38,7 +38,7 @@ def _frames(device: str, frame_id: int, camera: Camera, size: int | None) -> Ite
             if not read or bgr.shape[:2] != (camera.height, camera.width):
                 raise SourceError(f"camera:{device}: gave a frame that cannot be read, or of another size")
             image, resized = shrunk(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
-            yield CapturedFrame(frame_id, image, "rgb8", resized, f"camera{device}#{frame_id}", at_ns)
+            yield CapturedFrame(frame_id, image, "rgb8", resized, f"camera{device}#{frame_id}", at_ns, origin=origin)
             frame_id += 1
 
 

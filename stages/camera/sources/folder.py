@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from fieldpose.stages.camera.calibration import calibrate, shrunk
+from fieldpose.errors import DatasetError, SourceError
+from fieldpose.stages.camera.calibration import Calibrator, shrunk
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
-from fieldpose.stages.errors import DatasetError, SourceError
 from fieldpose.stages.nerf.datasets.images import EXTENSIONS, load_pixels, over_background, probe
 
 _ORIENTATION = 0x0112
 
 
-def open_folder(rest: str, config: CameraConfig) -> Source:
+def open_folder(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
     """folder:DIR. Raises SourceError for a missing or empty folder, and for a file that is no image."""
     root = Path(rest)
     if not root.is_dir():
@@ -26,13 +26,13 @@ def open_folder(rest: str, config: CameraConfig) -> Source:
     paths = sorted((path for path in root.iterdir() if path.suffix.lower() in EXTENSIONS), key=natural)
     if not paths:
         raise SourceError(f"{root}: no images in this folder; expected {', '.join(EXTENSIONS)}")
-    origin = calibrate(config, *_size(paths[0]), paths[0]).origin
+    told = calibrator.of(*_size(paths[0]), paths[0]).told
 
     def frames(first: int) -> Iterator[CapturedFrame]:
         for i, path in enumerate(paths[first:], first):
-            yield _read(i, path, config)
+            yield _read(i, path, config, calibrator)
 
-    return Source(f"{len(paths)} images of {root}, {origin}", "none", frames, len(paths))
+    return Source(f"{len(paths)} images of {root}, {told}", "none", frames, len(paths))
 
 
 def natural(path: Path) -> list[tuple[int, str]]:
@@ -41,18 +41,19 @@ def natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
 
 
-def _read(frame_id: int, path: Path, config: CameraConfig) -> CapturedFrame:
+def _read(frame_id: int, path: Path, config: CameraConfig, calibrator: Calibrator) -> CapturedFrame:
     width, height = _size(path)
-    camera = calibrate(config, width, height, path).camera
+    calibration = calibrator.of(width, height, path)
+    camera, origin = calibration.camera, calibration.origin
     if _can_stay_encoded(path) and (config.size is None or max(width, height) <= config.size):
         encoded = np.frombuffer(path.read_bytes(), np.uint8)
-        return CapturedFrame(frame_id, encoded, "jpeg", camera, path.name)
+        return CapturedFrame(frame_id, encoded, "jpeg", camera, path.name, origin=origin)
     try:
         pixels = over_background(load_pixels(path, width, height, probe(path).has_alpha), "white")
     except DatasetError as error:
         raise SourceError(str(error)) from error
     image, camera = shrunk(pixels, camera, config.size)
-    return CapturedFrame(frame_id, image, "rgb8", camera, path.name)
+    return CapturedFrame(frame_id, image, "rgb8", camera, path.name, origin=origin)
 
 
 def _size(path: Path) -> tuple[int, int]:

@@ -8,25 +8,22 @@ from itertools import islice
 from typing import cast
 
 import cv2
-import msgspec
 import numpy as np
 
-from fieldpose.bus.errors import RecordingError
 from fieldpose.bus.messages import Frame, Truth
 from fieldpose.bus.replay import Recorded, read_recording
 from fieldpose.bus.topics import FRAME, TRUTH
-from fieldpose.stages.camera.calibration import shrunk
+from fieldpose.errors import RecordingError, SourceError
+from fieldpose.stages.camera.calibration import Calibrator, shrunk
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source, TruePose
-from fieldpose.stages.errors import SourceError
-from fieldpose.stages.geometry import Camera
 
 _TRUTH_MAY_LAG = 4
 _TRUTHS_KEPT = 64
 
 
-def open_recording(rest: str, config: CameraConfig) -> Source:
-    """mcap:FILE. Raises SourceError for a file that cannot be read, without frames, or with several cameras."""
+def open_recording(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
+    """mcap:FILE, which holds its cameras. Raises SourceError for one without frames, or with several cameras."""
 
     def frames(first: int) -> Iterator[CapturedFrame]:
         return islice(_frames(rest, config.size), first, None)
@@ -38,15 +35,16 @@ def open_recording(rest: str, config: CameraConfig) -> Source:
 
 def _frames(path: str, size: int | None) -> Iterator[CapturedFrame]:
     for frame, truth in _with_truths(path):
-        camera = Camera(**msgspec.structs.asdict(frame.camera))
-        header = frame.header
+        camera, header = frame.camera, frame.header
         known = None if truth is None else TruePose(truth.cam_from_object)
         image, encoding = frame.image, frame.encoding
         if size is not None and max(camera.width, camera.height) > size:
             image, camera = shrunk(_decoded(frame, path), camera, size)
             encoding = "rgb8"
         name = f"frame {header.frame_id}"
-        yield CapturedFrame(header.frame_id, image, encoding, camera, name, header.capture_ns, known)
+        yield CapturedFrame(
+            header.frame_id, image, encoding, camera, name, header.capture_ns, known, frame.camera_origin
+        )
 
 
 def _with_truths(path: str) -> Iterator[tuple[Frame, Truth | None]]:

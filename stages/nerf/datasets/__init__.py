@@ -1,6 +1,6 @@
 """Readers of posed photographs: NeRF-synthetic, transforms.json and LLFF, behind one load_dataset."""
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets.bounds import SceneBounds
 from fieldpose.stages.nerf.datasets.loader import load_dataset
 from fieldpose.stages.nerf.datasets.records import Dataset, ImageRecord, find_name

@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets import images
 from fieldpose.stages.nerf.datasets.bounds import SceneBounds, box_bounds, object_bounds, unbounded_bounds
 from fieldpose.stages.nerf.datasets.records import Dataset, ImageRecord, Kind, Scene

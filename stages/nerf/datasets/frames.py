@@ -10,7 +10,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry.rigid import inverse, is_rigid, nearest_rigid
 from fieldpose.stages.nerf.datasets.images import EXTENSIONS, ImageHeader, probe
 from fieldpose.stages.nerf.datasets.intrinsics import Intrinsics, camera_of
@@ -98,9 +98,7 @@ def check_distinct(file: Path, records: Sequence[ImageRecord]) -> None:
 def checked_rigid(object_from_cam: np.ndarray, where: str) -> np.ndarray:
     """The rigid transform that a stored matrix is, its rounding removed. DatasetError if it is not nearly one."""
     if not np.all(np.isfinite(object_from_cam)):
-        raise DatasetError(
-            f"{where}: the pose has a number that is not finite; take the image out or pose it again"
-        )
+        raise DatasetError(f"{where}: the pose has a number that is not finite; take the image out or pose it again")
     if not is_rigid(object_from_cam, RIGID_TOLERANCE):
         scale = np.linalg.norm(object_from_cam[:3, :3], axis=0)
         determinant = np.linalg.det(object_from_cam[:3, :3])
@@ -178,9 +176,7 @@ def _record(
 def _matrix(frame: Frame, where: str) -> np.ndarray:
     rows = frame.transform_matrix
     if len(rows) not in (3, 4) or any(len(row) != 4 for row in rows):
-        raise DatasetError(
-            f"{where}: transform_matrix must be 4x4, got {len(rows)} rows of {[len(r) for r in rows]}"
-        )
+        raise DatasetError(f"{where}: transform_matrix must be 4x4, got {len(rows)} rows of {[len(r) for r in rows]}")
     return np.array(rows if len(rows) == 4 else [*rows, [0, 0, 0, 1]], dtype=np.float64)
 
 

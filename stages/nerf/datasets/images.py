@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 _Result = TypeVar("_Result")

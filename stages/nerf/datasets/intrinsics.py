@@ -7,7 +7,7 @@ import math
 import msgspec
 import numpy as np
 
-from fieldpose.stages.errors import DatasetError, StageError
+from fieldpose.errors import DatasetError, GeometryError
 from fieldpose.stages.geometry.cameras import Camera
 from fieldpose.stages.nerf.datasets.images import ImageHeader
 
@@ -35,9 +35,7 @@ class Intrinsics(msgspec.Struct, kw_only=True):
     is_fisheye: bool | None = None
 
 
-def camera_of(
-    document: Intrinsics, frame: Intrinsics, header: ImageHeader, pixel_centre: float, where: str
-) -> Camera:
+def camera_of(document: Intrinsics, frame: Intrinsics, header: ImageHeader, pixel_centre: float, where: str) -> Camera:
     """The camera of one frame: its own numbers first, the file's next, a centred principal point last.
 
     pixel_centre: the coordinate that the file gives to the centre of the first pixel (COLMAP's is 0.5).
@@ -54,7 +52,7 @@ def camera_of(
     try:
         camera = Camera(header.width, header.height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
         _check_invertible(camera)
-    except StageError as error:
+    except GeometryError as error:
         raise DatasetError(f"{where}: {error}") from error
     return camera
 

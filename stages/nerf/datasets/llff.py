@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry.cameras import Camera
 from fieldpose.stages.geometry.rigid import from_rotation, inverse
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
@@ -21,9 +21,7 @@ BOUND_FACTOR = 0.75
 _ASPECT_TOLERANCE = 0.02
 
 
-def read_llff(
-    root: Path, holdout: Holdout | None, normalise: bool, downscale: int | None, size: int | None
-) -> Draft:
+def read_llff(root: Path, holdout: Holdout | None, normalise: bool, downscale: int | None, size: int | None) -> Draft:
     """All images, sorted by name; "auto" holds every eighth out, the first among them.
 
     Images come from the folder of that `downscale`, else from the smallest that still has `size`, else from the
@@ -90,9 +88,7 @@ def _check_numbers(file: Path, hwf: np.ndarray, depths: np.ndarray) -> None:
     bad_depths = ~(np.isfinite(depths).all(axis=1) & (depths[:, 0] > 0) & (depths[:, 0] < depths[:, 1]))
     if bad_camera.any():
         i = int(np.argmax(bad_camera))
-        raise DatasetError(
-            f"{file}: image {i}: height, width and focal length must be positive, got {hwf[i].tolist()}"
-        )
+        raise DatasetError(f"{file}: image {i}: height, width and focal length must be positive, got {hwf[i].tolist()}")
     if bad_depths.any():
         i = int(np.argmax(bad_depths))
         raise DatasetError(f"{file}: image {i}: expected depths 0 < near < far, got {depths[i].tolist()}")
@@ -114,9 +110,7 @@ def _choose_folder(root: Path, hwf: np.ndarray, downscale: int | None, size: int
         raise DatasetError(f"{root}: no folder images, images_4 or images_8; put the images of {FILE} there")
     if downscale is not None:
         if downscale not in folders:
-            raise DatasetError(
-                f"{root}: no images at downscale {downscale}; there are {', '.join(map(str, folders))}"
-            )
+            raise DatasetError(f"{root}: no images at downscale {downscale}; there are {', '.join(map(str, folders))}")
         return folders[downscale]
     enough = [factor for factor in folders if size is not None and max(hwf[0], hwf[1]) / factor >= size]
     return folders[max(enough, default=min(folders))]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets import blender, llff, transforms
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, Split, assemble
 from fieldpose.stages.nerf.datasets.records import Dataset
@@ -40,9 +40,7 @@ def load_dataset(
 
 def _read(root: Path, holdout: Holdout | None, normalise: bool, downscale: int | None, size: int | None) -> Draft:
     if not root.is_dir():
-        what = (
-            "a file; give the folder that it is in" if root.exists() else "no such folder; give a dataset's folder"
-        )
+        what = "a file; give the folder that it is in" if root.exists() else "no such folder; give a dataset's folder"
         raise DatasetError(f"{root}: {what}")
     if (root / blender.TRAIN_FILE).is_file():
         return blender.read_blender(root)

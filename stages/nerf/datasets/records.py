@@ -5,13 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
+import msgspec
 import numpy as np
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry.cameras import Camera
 from fieldpose.stages.nerf.datasets import images
 from fieldpose.stages.nerf.datasets.bounds import SceneBounds
@@ -114,7 +115,9 @@ class Dataset:
         """sha256 (hex) over names, cameras, poses and the bytes of the image files."""
         digest = hashlib.sha256()
         for record in self.images:
-            digest.update(json.dumps([record.name, record.split, asdict(record.camera)], sort_keys=True).encode())
+            digest.update(
+                json.dumps([record.name, record.split, msgspec.structs.asdict(record.camera)], sort_keys=True).encode()
+            )
             digest.update(np.ascontiguousarray(record.cam_from_object, dtype="<f8").tobytes())
             digest.update(record.path.read_bytes())
         return digest.hexdigest()

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
 from fieldpose.stages.nerf.datasets.frames import Document, Frame, find_image, read_document, read_records
 from fieldpose.stages.nerf.datasets.records import ImageRecord
@@ -43,9 +43,7 @@ def _leave_out_deleted(file: Path, document: Document) -> tuple[str, ...]:
     return (f"{file.name}: {len(deleted)} of {total} frames have no image and are left out: {', '.join(deleted)}",)
 
 
-def _split(
-    file: Path, document: Document, records: list[ImageRecord], holdout: Holdout | None
-) -> list[ImageRecord]:
+def _split(file: Path, document: Document, records: list[ImageRecord], holdout: Holdout | None) -> list[ImageRecord]:
     train, test = document.train_filenames, document.test_filenames or document.val_filenames
     if train is None and test is None:
         return [replace(record, split=split_of(i, holdout)) for i, record in enumerate(records)]

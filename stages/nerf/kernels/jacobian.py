@@ -100,9 +100,7 @@ def render_jacobian(
     du = np.empty((3, samples.t.shape[0]), np.float32)
     for start in range(first, last, size):
         count = min(size, last - start)
-        rows, _ = forward(
-            net, dom, origins, directions, jitter, start, count, per_ray, stop_below, True, samples, rays
-        )
+        rows, _ = forward(net, dom, origins, directions, jitter, start, count, per_ray, stop_below, True, samples, rays)
         rows = compact(samples, rays, rows)
         for r in range(count):
             for c in range(3):

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fieldpose.errors import ConfigError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Clock, Feed, Source
 from fieldpose.stages.camera.progress import Progress
-from fieldpose.stages.errors import ConfigError
 from fieldpose.stages.geometry import Camera
 
 MS = 1_000_000

@@ -11,9 +11,9 @@ from PIL import Image
 from fieldpose.bus.messages import Frame, State, TrackingState
 from fieldpose.bus.node import EndOfInput, first_header
 from fieldpose.bus.topics import STATE
+from fieldpose.errors import SourceError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.node import CameraNode
-from fieldpose.stages.errors import SourceError
 
 
 @pytest.fixture

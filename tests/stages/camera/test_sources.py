@@ -13,14 +13,14 @@ import pytest
 from PIL import Image
 from support.posed_images import CAMERA, write_blender, write_transforms
 
-from fieldpose.bus.messages import CameraModel, Frame, Truth
+from fieldpose.bus.messages import Camera, Frame, Truth
 from fieldpose.bus.node import first_header
 from fieldpose.bus.recorder import RecordingWriter
 from fieldpose.bus.topics import FRAME, TRUTH, Address
+from fieldpose.errors import DatasetError, SourceError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame
 from fieldpose.stages.camera.sources import KINDS, is_video, open_source
-from fieldpose.stages.errors import DatasetError, SourceError
 from fieldpose.stages.geometry import Camera, look_at
 
 MS = 1_000_000
@@ -210,7 +210,7 @@ def record(path: Path, order: list[tuple[str, int]], camera: str = "camera0", en
         image = shade(frame_id)
         if encoding == "jpeg":
             image = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
-        model = CameraModel(48, 32, 50.0, 50.0, 23.5, 15.5)
+        model = Camera(48, 32, 50.0, 50.0, 23.5, 15.5)
         frame = Frame(header=header, image=image, encoding=encoding, camera=model)  # type: ignore[arg-type]
         writer.write(address.key(FRAME), FRAME, frame, i)
     writer.close()
@@ -242,7 +242,7 @@ def test_a_recording_of_two_cameras_is_not_mixed(tmp_path: Path) -> None:
     path = record(tmp_path / "one.mcap", [("frame", 0)])
     writer = RecordingWriter(tmp_path / "two.mcap")
     for i, camera in enumerate(("left", "right")):
-        model = CameraModel(48, 32, 50.0, 50.0, 23.5, 15.5)
+        model = Camera(48, 32, 50.0, 50.0, 23.5, 15.5)
         frame = Frame(header=first_header(i, i), image=shade(0), encoding="rgb8", camera=model)
         writer.write(Address(camera=camera).key(FRAME), FRAME, frame, i)
     writer.close()
@@ -289,7 +289,7 @@ def test_libraries_print_nothing_about_what_cannot_be_opened(tmp_path: Path) -> 
 import sys
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.sources import open_source
-from fieldpose.stages.errors import SourceError
+from fieldpose.errors import SourceError
 for source in sys.argv[1:]:
     try:
         open_source(CameraConfig(source))

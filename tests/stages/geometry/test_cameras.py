@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldpose.stages.errors import StageError
+from fieldpose.errors import GeometryError
 from fieldpose.stages.geometry import Camera, exp_se3, look_at, points_at_depth, rays
 from fieldpose.stages.geometry.cameras import distort
 
@@ -72,7 +72,7 @@ def test_points_behind_the_camera_have_no_pixel() -> None:
 
 def test_a_distortion_that_folds_the_image_is_refused() -> None:
     folding = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, (-0.5, 0.0, 0.0, 0.0, 0.0))
-    with pytest.raises(StageError, match=r"no inverse at pixel \(0\.0, 0\.0\)"):
+    with pytest.raises(GeometryError, match=r"no inverse at pixel \(0\.0, 0\.0\)"):
         folding.directions(np.array([[320.0, 240.0], [0.0, 0.0]]))
 
 
@@ -110,7 +110,7 @@ def test_without_distortion_undoes_it(camera: Camera, seed: int) -> None:
 def test_solutions_beyond_the_fold_are_none(k1: float, k2: float, radius: float) -> None:
     """Mirrored (radial factor below zero) and folded (derivative below zero) ones."""
     camera = Camera(640, 480, 300.0, 300.0, 320.0, 240.0, (k1, k2, 0.0, 0.0, 0.0))
-    with pytest.raises(StageError, match="no inverse"):
+    with pytest.raises(GeometryError, match="no inverse"):
         camera.directions(np.array([[320.0 + 300 * radius, 240.0]]))
 
 
@@ -174,5 +174,5 @@ def test_rays_of_all_pixels_follow_the_grid() -> None:
 def test_numbers_that_make_no_camera_are_refused(wrong: dict) -> None:
     right = {"width": 4, "height": 3, "fx": 5.0, "fy": 5.0, "cx": 1.5, "cy": 1.0}
     assert not Camera(**right).is_distorted
-    with pytest.raises(StageError, match="a camera needs"):
+    with pytest.raises(GeometryError, match="a camera needs"):
         Camera(**(right | wrong))

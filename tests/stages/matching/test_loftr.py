@@ -8,7 +8,7 @@ import torch
 from kornia.feature import LoFTR
 from support.pictures import picture
 
-from fieldpose.stages.errors import WeightsError
+from fieldpose.errors import WeightsError
 from fieldpose.stages.matching.core import Matcher, MatchingConfig, PairMatcher, build_matcher
 
 CELL = 8

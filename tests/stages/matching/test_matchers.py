@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from support.pictures import WarpedPair, needs, picture, warped
 
-from fieldpose.stages.errors import ConfigError
+from fieldpose.errors import ConfigError
 from fieldpose.stages.matching.core import MATCHERS, Matcher, MatchingConfig, PairMatcher, build_matcher
 
 SOLID = np.ones((256, 256), np.float32)

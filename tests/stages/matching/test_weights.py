@@ -4,7 +4,7 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from fieldpose.stages.errors import WeightsError
+from fieldpose.errors import WeightsError
 from fieldpose.stages.matching.weights import WeightsFile, find_weights, load_network, read_state
 
 FILE = WeightsFile("net.pt", "carries-net", "carries_net/weights/net.pt", ("https://example.org/net.pt",))

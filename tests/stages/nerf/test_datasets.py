@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 from support import posed_images as made
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry import camera_centre, inverse, is_rigid, look_at, rotation_error_deg, translation_error
 from fieldpose.stages.nerf.datasets import Dataset, find_name, load_dataset
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support import posed_images as made
 
-from fieldpose.stages.errors import DatasetError
+from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets import load_dataset
 
 SQUARE = made.centred(80, 80, 95.0)

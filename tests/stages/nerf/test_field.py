@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load_file, save_file
 
-from fieldpose.stages.errors import FieldFileError
+from fieldpose.errors import FieldFileError
 from fieldpose.stages.geometry import Camera, look_at
 from fieldpose.stages.nerf.config import FieldConfig
 from fieldpose.stages.nerf.field import Field, grid_layout, load_field, new_net

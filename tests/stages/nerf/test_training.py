@@ -11,7 +11,7 @@ import torch
 from support import posed_images
 from support.analytic_scene import AnalyticScene
 
-from fieldpose.stages.errors import ConfigError, DatasetError
+from fieldpose.errors import ConfigError, DatasetError
 from fieldpose.stages.geometry import Camera, look_at, rays
 from fieldpose.stages.nerf import from_dataset
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
-from fieldpose.stages.errors import StageError
+from fieldpose.errors import GeometryError
 from fieldpose.stages.geometry import Camera, exp_se3, perturb, rays, rotation_error_deg, translation_error
 from fieldpose.stages.nerf.rendering_api import RenderedView
 from fieldpose.stages.pnp.alignment import Aligner, Pictures, Placed, inverse_depth_slopes
@@ -279,7 +279,7 @@ def test_points_found_where_the_lens_has_no_inverse_leave_the_pose_of_the_matche
     pixels = in_frame(points[inner], folding).astype(np.float32)
     corner = Placed(np.arange(20), np.tile([[5.0, 5.0]], (20, 1)), np.tile(np.eye(2), (20, 1, 1)), np.ones(20, bool))
     monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: corner)
-    with pytest.raises(StageError):
+    with pytest.raises(GeometryError):
         folding.directions(corner.pixels)
     plain = solve(pixels, points[inner], folding)
     looked = solve(pixels, points[inner], folding, pictures=pictures(view, frame))

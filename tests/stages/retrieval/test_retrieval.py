@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support.pictures import needs
 
 from fieldpose.deploy.scene import demo_file
-from fieldpose.stages.errors import ConfigError
+from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry import camera_centre
 from fieldpose.stages.matching.core import MatchingConfig
 from fieldpose.stages.nerf.datasets import load_dataset

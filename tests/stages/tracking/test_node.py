@@ -16,7 +16,7 @@ from support.posed_images import CAMERA, write_blender
 
 from fieldpose.bus.memory import MemoryBus
 from fieldpose.bus.messages import (
-    CameraModel,
+    Camera,
     Frame,
     Guess,
     GuessReason,
@@ -31,9 +31,9 @@ from fieldpose.bus.messages import (
 from fieldpose.bus.node import Handler, Output, first_header, reply_header, run_node
 from fieldpose.bus.ports import Inbox
 from fieldpose.bus.topics import FRAME, GUESS, POSE, RETRIEVED, STATE, TRUTH, Address, Topic
+from fieldpose.errors import ConfigError, FieldFileError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.node import CameraNode
-from fieldpose.stages.errors import ConfigError, FieldFileError
 from fieldpose.stages.geometry import rotation_error_deg
 from fieldpose.stages.nerf.config import FieldConfig
 from fieldpose.stages.nerf.field import Field, new_net
@@ -170,7 +170,7 @@ def test_a_bad_field_or_guess_is_refused_at_start(scene: Path) -> None:
 def test_frames_skipped_by_the_bus_are_counted_at_the_door(scene: Path) -> None:
     node = TrackingNode(scene / "field", TrackingConfig(depth=4))
     node.start()
-    model = CameraModel(32, 32, 30.0, 30.0, 15.5, 15.5)
+    model = Camera(32, 32, 30.0, 30.0, 15.5, 15.5)
     for sequence in (0, 3):
         header = msgspec.structs.replace(first_header(sequence, sequence), source="camera", sequence=sequence)
         frame = Frame(header=header, image=np.zeros((32, 32, 3), np.uint8), encoding="rgb8", camera=model)
@@ -183,7 +183,7 @@ def test_what_retrieval_names_is_tried_next(scene: Path) -> None:
     node = TrackingNode(scene / "field", TrackingConfig())
     node.start()
     header = first_header(0, 5)
-    model = CameraModel(32, 32, 30.0, 30.0, 15.5, 15.5)
+    model = Camera(32, 32, 30.0, 30.0, 15.5, 15.5)
     frame = Frame(header=header, image=np.zeros((32, 32, 3), np.uint8), encoding="rgb8", camera=model)
     guess = next(iter(node.handle(FRAME, frame)))[1]
     assert isinstance(guess, Guess)
@@ -201,7 +201,7 @@ def test_what_retrieval_names_is_tried_next(scene: Path) -> None:
 
 
 def test_a_pose_that_is_no_rigid_transform_is_a_failure() -> None:
-    model = CameraModel(32, 32, 30.0, 30.0, 15.5, 15.5)
+    model = Camera(32, 32, 30.0, 30.0, 15.5, 15.5)
     good = Guess(header=first_header(0, 0), reason=GuessReason.PRIOR, cam_from_object=np.eye(4), camera=model)
     assert pose_result(answer(good)).ok
     sheared = np.eye(4)

@@ -15,7 +15,7 @@ from fieldpose.stages.tracking.policy import PoseResult
 from fieldpose.stages.tracking.scoring import deviations, score
 from fieldpose.stages.tracking.trust import Trust
 
-GOOD = PoseResult(0, 0, True, np.eye(4), np.diag([1e-6] * 6), inliers=100, correspondences=120, residual_px=0.8)
+GOOD = PoseResult(0, 0, np.eye(4), np.diag([1e-6] * 6), inliers=100, correspondences=120, residual_px=0.8)
 
 
 def tracking(**settings: int) -> Trust:
@@ -91,7 +91,7 @@ def test_after_the_first_pose_it_never_initializes_again(events: list[str]) -> N
 
 def test_score_is_one_for_a_good_pose_and_zero_for_none() -> None:
     assert score(GOOD, ScoreConfig()) == 1.0
-    assert score(replace(GOOD, ok=False), ScoreConfig()) == 0.0
+    assert score(replace(GOOD, cam_from_object=None), ScoreConfig()) == 0.0
     assert score(replace(GOOD, inliers=7), ScoreConfig()) == 0.0
 
 

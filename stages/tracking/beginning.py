@@ -10,17 +10,25 @@ from typing import Any
 
 import numpy as np
 
-from fieldpose.stages.errors import ConfigError
+from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry import is_rigid, nearest_rigid
+from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.tracking.config import TrackingConfig
-from fieldpose.stages.tracking.frame_policies import Disturbance, EachFramePolicy, PerturbedTruthPolicy
+from fieldpose.stages.tracking.photos import PhotoPolicy
 from fieldpose.stages.tracking.policy import Policy
-from fieldpose.stages.tracking.retrieved import RetrievedPoses
-from fieldpose.stages.tracking.track_policy import TrackPolicy
-from fieldpose.stages.tracking.views import TrainingViews
+from fieldpose.stages.tracking.priors import Priors
+from fieldpose.stages.tracking.video import VideoPolicy
 
 _PERTURB = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)deg,(\d+(?:\.\d+)?)")
 _RIGID_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """How far a guess is from the truth: angle (least, most) in degrees, largest shift in object units."""
+
+    angle_deg: tuple[float, float] = (10.0, 40.0)
+    max_translation: float = 0.2
 
 
 @dataclass(frozen=True)
@@ -31,32 +39,41 @@ class GuessFile:
     frames: dict[int, np.ndarray] = field(default_factory=dict)
 
 
-def make_policy(config: TrackingConfig, views: TrainingViews, retrieved: RetrievedPoses | None = None) -> Policy:
-    """The policy that `config.guess` asks for; it looks into `retrieved`. Raises ConfigError."""
-    spec, retrieved = config.guess, retrieved or RetrievedPoses()
-    if spec is not None and spec.startswith("perturb:"):
-        return PerturbedTruthPolicy(config, views, disturbance(spec), retrieved.of)
-    if spec is None or spec.startswith("train:"):
-        return TrackPolicy(config, views, None if spec is None else start_pose(spec, views), retrieved)
-    content = read_guess_file(Path(spec))
-    if content.frames:
-        return EachFramePolicy(config, views, content.frames, retrieved.of)
-    return TrackPolicy(config, views, content.start, retrieved)
+@dataclass(frozen=True)
+class Beginning:
+    """Where tracking begins.
+
+    start: (4, 4) for every photo, or the first frame of a video; frames: (4, 4) by frame_id; disturbance: frames come
+    with their true poses, so disturbed, as priors.
+    """
+
+    start: np.ndarray | None = None
+    frames: dict[int, np.ndarray] = field(default_factory=dict)
+    disturbance: Disturbance | None = None
+
+    @property
+    def by_frame(self) -> bool:
+        """Whether each frame has a guess of its own, so that no frame is to begin without it."""
+        return bool(self.frames) or self.disturbance is not None
 
 
-def needs_truth(spec: str | None) -> bool:
-    """Whether guesses of this kind are made from the true poses."""
-    return spec is not None and spec.startswith("perturb:")
-
-
-def start_pose(spec: str, views: TrainingViews) -> np.ndarray:
-    """cam_from_object (4, 4) of train:NAME, or of a file that holds one pose. Raises ConfigError."""
+def beginning(spec: str | None, views: TrainingViews | None) -> Beginning:
+    """What `--guess` asks for; of a training view nothing where these are not known. Raises ConfigError."""
+    if spec is None:
+        return Beginning()
+    if spec.startswith("perturb:"):
+        return Beginning(disturbance=disturbance(spec))
     if spec.startswith("train:"):
-        return views.pose_of(spec.removeprefix("train:"))
-    start = read_guess_file(Path(spec)).start
-    if start is None:
-        raise ConfigError(f'{spec}: holds a guess for each frame, but one pose is needed: {{"cam_from_object": ...}}')
-    return start
+        return Beginning() if views is None else Beginning(start=views.pose_of(spec.removeprefix("train:")))
+    content = read_guess_file(Path(spec))
+    return Beginning(content.start, content.frames)
+
+
+def make_policy(config: TrackingConfig, views: TrainingViews, looks: bool = False) -> Policy:
+    """The policy for the configured sequence and guess; `looks`: whether retrieval can be asked. Raises ConfigError."""
+    begins = beginning(config.guess, views)
+    policy = PhotoPolicy if config.sequence == "photos" or begins.by_frame else VideoPolicy
+    return policy(config, views, Priors(begins.by_frame, begins.frames), begins.start, looks)
 
 
 def disturbance(spec: str) -> Disturbance:

@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.tracking_world import on_sphere, ring_of_views
-
-from fieldpose.bus.messages import GuessReason, TrackingState
-from fieldpose.stages.errors import ConfigError, DatasetError
-from fieldpose.stages.geometry import rotation_error_deg, translation_error
-from fieldpose.stages.tracking.config import TrackingConfig
-from fieldpose.stages.tracking.distance import Limit, pairwise
 from fieldpose.stages.tracking.frame_policies import EachFramePolicy, PerturbedTruthPolicy
 from fieldpose.stages.tracking.guesses import make_policy, needs_truth, start_pose
-from fieldpose.stages.tracking.policy import Attempt, FrameInfo, PoseResult
 from fieldpose.stages.tracking.retrieved import RetrievedPoses
 from fieldpose.stages.tracking.track_policy import TrackPolicy
 from fieldpose.stages.tracking.views import Keyframes, Relocaliser, TrainingViews, farthest_point_order, nearest_first
+from support.tracking_world import on_sphere, ring_of_views
+
+from fieldpose.bus.messages import GuessReason, TrackingState
+from fieldpose.errors import ConfigError, DatasetError
+from fieldpose.stages.geometry import rotation_error_deg, translation_error
+from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.distance import Limit, pairwise
+from fieldpose.stages.tracking.policy import Attempt, FrameInfo, PoseResult
 
 VIEWS = ring_of_views()
 FRAME = FrameInfo(7, 0)

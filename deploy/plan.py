@@ -1,0 +1,124 @@
+"""What is to be run: settings in which nothing is left open any more, and how each was decided."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from fieldpose.deploy.settings import Settings
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.sources import is_video
+from fieldpose.stages.nerf.backend import resolved
+from fieldpose.stages.nerf.training_views import TrainingViews
+from fieldpose.stages.refinement.config import RefinementConfig
+from fieldpose.stages.rendering.config import RenderingConfig
+from fieldpose.stages.tracking.beginning import Beginning, beginning
+
+VIDEO_VIEW_SIZE, PHOTO_VIEW_SIZE = 256, 400
+"""On lego a view of 256 pixels takes half the time of one of 400, and one step from it errs nearly twice as much."""
+VIDEO_REUSE_DEG = 5.0
+
+Sequence = Literal["video", "photos"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A pipeline to be run: its field, and settings without any "auto".
+
+    looks: whether retrieval can be asked. notes: what was decided, and why, by name.
+    """
+
+    settings: Settings
+    field: Path | None = None
+    looks: bool = True
+    begins: Beginning = dataclasses.field(default_factory=Beginning)
+    notes: dict[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def independent(self) -> bool:
+        """Whether frames stand each by itself: photos, and frames with guesses of their own."""
+        return self.settings.tracking.sequence == "photos" or self.begins.by_frame
+
+
+def resolve(settings: Settings, views: TrainingViews | None, field: Path | None = None) -> Plan:
+    """Decide what the settings leave open, for their source and for a field with these training views.
+
+    A resolved plan's settings give the same plan again. views: None for a process that has no field. Raises
+    ConfigError, SourceError and DatasetError.
+    """
+    notes: dict[str, str] = {}
+    sequence = _sequence(settings, notes)
+    begins = beginning(settings.tracking.guess, views)
+    looks = _looks(settings, views, begins, notes)
+    backend = resolved(settings.backend)
+    notes["backend"] = f"{backend}{' (auto)' if settings.backend == 'auto' else ''}"
+    resolved_settings = replace(
+        settings,
+        backend=backend,
+        camera=_camera(settings.camera, notes),
+        tracking=replace(settings.tracking, sequence=sequence),
+        rendering=_rendering(settings.rendering, sequence, sequence == "photos" or begins.by_frame, notes),
+        matching=replace(settings.matching, device=_device(settings.matching.device, backend)),
+        refinement=_refinement(settings.refinement, sequence, notes),
+    )
+    return Plan(resolved_settings, field, looks, begins, notes)
+
+
+def _sequence(settings: Settings, notes: dict[str, str]) -> Sequence:
+    wanted, source = settings.tracking.sequence, settings.camera.source
+    if wanted != "auto":
+        notes["sequence"] = wanted
+        return wanted
+    video = not source or is_video(source)
+    notes["sequence"] = f"{'video' if video else 'photos'} (auto: {f'source {source}' if source else 'no source here'})"
+    return "video" if video else "photos"
+
+
+def _looks(settings: Settings, views: TrainingViews | None, begins: Beginning, notes: dict[str, str]) -> bool:
+    remembers = views is None or views.descriptors is not None
+    if not remembers:
+        notes["retrieval"] = "off: the field does not know how its training views look; train it again"
+    else:
+        notes["retrieval"] = "on" if settings.retrieval.candidates > 0 else "off: --retrieval.candidates 0"
+    start = settings.tracking.guess or "training views"
+    notes["guess"] = f"{start}{', each frame its own' if begins.by_frame else ''}"
+    return remembers and settings.retrieval.candidates > 0
+
+
+def _camera(config: CameraConfig, notes: dict[str, str]) -> CameraConfig:
+    if config.pace != "auto" or not config.source:
+        return config
+    pace: Literal["live", "lockstep"] = "live" if is_video(config.source) else "lockstep"
+    notes["pace"] = f"{pace} (auto)"
+    return replace(config, pace=pace)
+
+
+def _rendering(
+    config: RenderingConfig, sequence: Sequence, independent: bool, notes: dict[str, str]
+) -> RenderingConfig:
+    if config.size == 0:
+        size = VIDEO_VIEW_SIZE if sequence == "video" else PHOTO_VIEW_SIZE
+        config, notes["view size"] = replace(config, size=size), f"{size} (auto: {sequence})"
+    if config.reuse_angle_deg is None:
+        angle_deg = 0.0 if independent else VIDEO_REUSE_DEG
+        told = (
+            "at the very same pose, so that no frame depends on another" if independent else f"within {angle_deg:g} deg"
+        )
+        config, notes["views used again"] = replace(config, reuse_angle_deg=angle_deg), f"{told} (auto)"
+    return config
+
+
+def _refinement(config: RefinementConfig, sequence: Sequence, notes: dict[str, str]) -> RefinementConfig:
+    if config.when != "auto":
+        return config
+    when: Literal["always", "never"] = "never" if sequence == "video" else "always"
+    notes["refinement"] = f"{when} (auto: {sequence})"
+    return replace(config, when=when)
+
+
+def _device(device: str, backend: str) -> str:
+    if device != "auto":
+        return device
+    return "cuda" if backend == "cuda" else "cpu"

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import asdict, fields
 
-import cv2
 import numpy as np
 
 from fieldpose.bus.messages import CameraModel, Frame, Header
 from fieldpose.stages.geometry import Camera
+from fieldpose.stages.images import decoded
 
 NO_CAMERA = CameraModel(1, 1, 1.0, 1.0, 0.0, 0.0)
 """Stands for the camera in the messages of failures, where none is known."""
@@ -26,15 +26,7 @@ def camera_model(camera: Camera) -> CameraModel:
 
 def frame_image(frame: Frame) -> np.ndarray | None:
     """The image (h, w, 3) uint8 RGB of a frame; None where its bytes are no image of the frame's size."""
-    if frame.encoding == "rgb8":
-        return frame.image
-    try:
-        bgr = cv2.imdecode(frame.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        return None
-    if bgr is None or bgr.shape[:2] != (frame.camera.height, frame.camera.width):
-        return None
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    return decoded(frame.encoding, frame.image, frame.camera.width, frame.camera.height)
 
 
 def frame_rng(header: Header) -> np.random.Generator:

@@ -6,15 +6,14 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import msgspec
-import numpy as np
 from PIL import Image
 
 from fieldpose.bus.messages import CameraModel
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.errors import SourceError, StageError
 from fieldpose.stages.geometry import Camera
+from fieldpose.stages.wire import camera_of
 
 _EXIF_IFD = 0x8769
 _FOCAL_LENGTH_35MM = 0xA405
@@ -50,8 +49,7 @@ def calibrate(config: CameraConfig, width: int, height: int, image: Path | None 
 def read_camera_file(path: Path) -> Camera:
     """Read a JSON file of width, height, fx, fy, cx, cy and, if there is any, distortion. Raises SourceError."""
     try:
-        model = msgspec.json.decode(path.read_bytes(), type=CameraModel)
-        return Camera(**msgspec.structs.asdict(model))
+        return camera_of(msgspec.json.decode(path.read_bytes(), type=CameraModel))
     except FileNotFoundError:
         raise SourceError(f"{path}: no such camera file") from None
     except (OSError, msgspec.DecodeError, StageError) as error:
@@ -70,15 +68,6 @@ def focal_length_from_exif(path: Path, width: int, height: int) -> float | None:
     except (OSError, ValueError, TypeError, SyntaxError):
         return None
     return focal_mm / _DIAGONAL_35MM * math.hypot(width, height) if focal_mm > 0 else None
-
-
-def shrunk(image: np.ndarray, camera: Camera, size: int | None) -> tuple[np.ndarray, Camera]:
-    """An RGB image (h, w, 3) and its camera, with the longer side at most `size`, averaged over areas."""
-    longer = max(camera.width, camera.height)
-    if size is None or longer <= size:
-        return image, camera
-    smaller = camera.scaled(size / longer)
-    return cv2.resize(image, (smaller.width, smaller.height), interpolation=cv2.INTER_AREA), smaller
 
 
 def _centred(width: int, height: int, focal: float) -> Camera:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict
 
 import numpy as np
 
-from fieldpose.bus.messages import CameraModel, Frame, Truth
+from fieldpose.bus.messages import Frame, Truth
 from fieldpose.bus.node import Output, first_header
 from fieldpose.bus.topics import FRAME, TRUTH
 from fieldpose.stages.camera.core import CapturedFrame
+from fieldpose.stages.wire import camera_model
 
 
 def messages_of(frame: CapturedFrame, capture_ns: int) -> Iterator[Output]:
@@ -19,8 +19,5 @@ def messages_of(frame: CapturedFrame, capture_ns: int) -> Iterator[Output]:
     if frame.truth is not None:
         known = frame.truth.cam_from_object
         yield TRUTH, Truth(header=header, cam_from_object=None if known is None else np.array(known, np.float64))
-    camera = CameraModel(**asdict(frame.camera))
-    yield (
-        FRAME,
-        Frame(header=header, image=np.ascontiguousarray(frame.image), encoding=frame.encoding, camera=camera),
-    )
+    image, camera = np.ascontiguousarray(frame.image), camera_model(frame.camera)
+    yield FRAME, Frame(header=header, image=image, encoding=frame.encoding, camera=camera)

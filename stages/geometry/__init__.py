@@ -1,6 +1,13 @@
 """Cameras, rigid transforms, pose errors and random poses: what every stage shares."""
 
-from fieldpose.stages.geometry.cameras import Camera, points_at_depth, rays
+from fieldpose.stages.geometry.cameras import (
+    Camera,
+    points_at_depth,
+    rays,
+    scale_pixels,
+    shrunk_size,
+    unscale_pixels,
+)
 from fieldpose.stages.geometry.errors import mahalanobis_squared, rotation_error_deg, translation_error, viewing_angles
 from fieldpose.stages.geometry.rigid import (
     adjoint,
@@ -34,7 +41,10 @@ __all__ = [
     "rays",
     "rotation_about",
     "rotation_error_deg",
+    "scale_pixels",
+    "shrunk_size",
     "translation_error",
     "twist_covariance",
+    "unscale_pixels",
     "viewing_angles",
 ]

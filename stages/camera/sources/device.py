@@ -8,12 +8,13 @@ from contextlib import contextmanager
 
 import cv2
 
-from fieldpose.stages.camera.calibration import calibrate, shrunk
+from fieldpose.stages.camera.calibration import calibrate
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.camera.sources.capture import opened
 from fieldpose.stages.errors import SourceError
 from fieldpose.stages.geometry import Camera
+from fieldpose.stages.images import shrunk_with_camera
 
 
 def open_device(rest: str, config: CameraConfig) -> Source:
@@ -37,7 +38,7 @@ def _frames(device: str, frame_id: int, camera: Camera, size: int | None) -> Ite
             read, bgr = capture.retrieve()
             if not read or bgr.shape[:2] != (camera.height, camera.width):
                 raise SourceError(f"camera:{device}: gave a frame that cannot be read, or of another size")
-            image, resized = shrunk(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
+            image, resized = shrunk_with_camera(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
             yield CapturedFrame(frame_id, image, "rgb8", resized, f"camera{device}#{frame_id}", at_ns)
             frame_id += 1
 

@@ -7,19 +7,17 @@ from collections.abc import Iterator
 from itertools import islice
 from typing import cast
 
-import cv2
-import msgspec
 import numpy as np
 
 from fieldpose.bus.errors import RecordingError
 from fieldpose.bus.messages import Frame, Truth
 from fieldpose.bus.replay import Recorded, read_recording
 from fieldpose.bus.topics import FRAME, TRUTH
-from fieldpose.stages.camera.calibration import shrunk
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source, TruePose
 from fieldpose.stages.errors import SourceError
-from fieldpose.stages.geometry import Camera
+from fieldpose.stages.images import shrunk_with_camera
+from fieldpose.stages.wire import camera_of, frame_image
 
 _TRUTH_MAY_LAG = 4
 _TRUTHS_KEPT = 64
@@ -38,12 +36,12 @@ def open_recording(rest: str, config: CameraConfig) -> Source:
 
 def _frames(path: str, size: int | None) -> Iterator[CapturedFrame]:
     for frame, truth in _with_truths(path):
-        camera = Camera(**msgspec.structs.asdict(frame.camera))
+        camera = camera_of(frame.camera)
         header = frame.header
         known = None if truth is None else TruePose(truth.cam_from_object)
         image, encoding = frame.image, frame.encoding
         if size is not None and max(camera.width, camera.height) > size:
-            image, camera = shrunk(_decoded(frame, path), camera, size)
+            image, camera = shrunk_with_camera(_decoded(frame, path), camera, size)
             encoding = "rgb8"
         name = f"frame {header.frame_id}"
         yield CapturedFrame(header.frame_id, image, encoding, camera, name, header.capture_ns, known)
@@ -80,9 +78,7 @@ def _messages(path: str) -> Iterator[Recorded]:
 
 
 def _decoded(frame: Frame, path: str) -> np.ndarray:
-    if frame.encoding == "rgb8":
-        return frame.image
-    bgr = cv2.imdecode(frame.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if bgr is None or bgr.shape[:2] != (frame.camera.height, frame.camera.width):
+    image = frame_image(frame)
+    if image is None:
         raise SourceError(f"{path}: the {frame.encoding} image of frame {frame.header.frame_id} cannot be read")
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    return image

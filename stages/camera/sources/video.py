@@ -8,12 +8,13 @@ from pathlib import Path
 
 import cv2
 
-from fieldpose.stages.camera.calibration import calibrate, shrunk
+from fieldpose.stages.camera.calibration import calibrate
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.camera.sources.capture import opened
 from fieldpose.stages.errors import SourceError
 from fieldpose.stages.geometry import Camera
+from fieldpose.stages.images import shrunk_with_camera
 
 _FALLBACK_FPS = 30.0
 
@@ -49,7 +50,7 @@ def _frames(path: Path, first: int, camera: Camera, fps: float, size: int | None
                 read, bgr = capture.retrieve()
                 if not read or bgr.shape[:2] != (camera.height, camera.width):
                     raise SourceError(f"{path}: frame {index} cannot be read, or is not of the first one's size")
-                image, resized = shrunk(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
+                image, resized = shrunk_with_camera(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
                 yield CapturedFrame(index, image, "rgb8", resized, f"{path.name}#{index}", round(at_ms * 1e6))
             index += 1
 

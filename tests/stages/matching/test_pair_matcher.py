@@ -12,7 +12,6 @@ from fieldpose.stages.matching.core import (
     MatchingConfig,
     PairMatcher,
     build_matcher,
-    shrink,
     visible_mask,
 )
 from fieldpose.stages.matching.subpixel import align_patches
@@ -124,13 +123,6 @@ def test_the_background_of_the_view_is_masked_inside_the_silhouette() -> None:
     assert not eroded[15, 25]
     np.testing.assert_array_equal(visible_mask(np.rint(opacity * 255).astype(np.uint8), 2), eroded)
     assert visible_mask(np.ones((5, 5), np.float32), 2).all()
-
-
-def test_shrinking_keeps_small_images_as_they_are() -> None:
-    image = picture(0, 64)
-    same, scale = shrink(image, 64)
-    assert same is image
-    np.testing.assert_array_equal(scale, (1, 1))
 
 
 def test_patches_are_aligned_to_a_fraction_of_a_pixel() -> None:

@@ -9,6 +9,7 @@ from fieldpose.stages.geometry.cameras import (
     unscale_pixels,
 )
 from fieldpose.stages.geometry.errors import mahalanobis_squared, rotation_error_deg, translation_error, viewing_angles
+from fieldpose.stages.geometry.jacobians import image_jacobian, twist_gradient
 from fieldpose.stages.geometry.rigid import (
     adjoint,
     camera_centre,
@@ -29,6 +30,7 @@ __all__ = [
     "adjoint",
     "camera_centre",
     "exp_se3",
+    "image_jacobian",
     "interpolate",
     "inverse",
     "is_rigid",
@@ -45,6 +47,7 @@ __all__ = [
     "shrunk_size",
     "translation_error",
     "twist_covariance",
+    "twist_gradient",
     "unscale_pixels",
     "viewing_angles",
 ]

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
-from fieldpose.stages.geometry import Camera
+from fieldpose.stages.geometry import Camera, image_jacobian
 
 _MAX_STEPS = 20
 CONVERGED = 1e-5
@@ -232,11 +232,7 @@ def reprojection(
     x, y, z = in_cam.T
     inverse = 1 / np.where(z > 1e-9, z, 1e-9)
     u, v = x * inverse, y * inverse
-    zero = np.zeros_like(u)
-    jacobian = np.empty((len(points), 2, 6))
-    jacobian[:, 0] = np.stack([inverse, zero, -u * inverse, -u * v, 1 + u * u, -v], axis=1)
-    jacobian[:, 1] = np.stack([zero, inverse, -v * inverse, -1 - v * v, u * v, u], axis=1)
-    jacobian *= np.array([camera.fx, camera.fy])[:, None]
+    jacobian = image_jacobian(u, v, inverse) * np.array([camera.fx, camera.fy])[:, None]
     residuals = np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], axis=1) - pixels
     residuals[z <= 0] = np.inf
     return residuals, jacobian

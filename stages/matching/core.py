@@ -7,18 +7,18 @@ write it in a file of this folder beside the others and name it in `MATCHERS`; n
 from __future__ import annotations
 
 import importlib
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
+from cachetools import LRUCache
 
 from fieldpose.stages.errors import ConfigError
 from fieldpose.stages.geometry import shrunk_size, unscale_pixels
 from fieldpose.stages.images import shrunk
-from fieldpose.stages.last_used import LastUsed
 from fieldpose.stages.matching.subpixel import align_patches
 
 MATCHERS = {
@@ -126,8 +126,8 @@ class PairMatcher:
 
     def __init__(self, matcher: Matcher, config: MatchingConfig) -> None:
         self._matcher, self._config = matcher, config
-        self._views: LastUsed[_Seen] = LastUsed(config.kept_views)
-        self._frames: LastUsed[_Seen] = LastUsed(_KEPT_FRAMES)
+        self._views: LRUCache[Hashable, _Seen] = LRUCache(config.kept_views)
+        self._frames: LRUCache[Hashable, _Seen] = LRUCache(_KEPT_FRAMES)
 
     def match(
         self,
@@ -170,22 +170,22 @@ class PairMatcher:
         if alike and new and isinstance(self._matcher, ExtractsAtOnce):
             mask, small = visible_mask(opacity, self._config.erode_px), shrunk(frame_image, longer_side)
             in_view, in_frame = self._matcher.extract_all([(rgb, mask), (small, None)])
-            view = self._views.get(view_key, lambda: _seen(in_view, rgb, rgb))
-            return view, self._frames.get(sized_key, lambda: _seen(in_frame, small, frame_image))
+            view = _kept(self._views, view_key, lambda: _seen(in_view, rgb, rgb))
+            return view, _kept(self._frames, sized_key, lambda: _seen(in_frame, small, frame_image))
         return self._view(rgb, opacity, view_key), self._frame(frame_image, longer_side, frame_key)
 
     def _view(self, rgb: np.ndarray, opacity: np.ndarray, key: Hashable | None) -> _Seen:
         def look() -> _Seen:
             return _seen(self._matcher.extract(rgb, visible_mask(opacity, self._config.erode_px)), rgb, rgb)
 
-        return self._views.get(key, look)
+        return _kept(self._views, key, look)
 
     def _frame(self, image: np.ndarray, longer_side: int, key: Hashable | None) -> _Seen:
         def look() -> _Seen:
             small = shrunk(image, longer_side)
             return _seen(self._matcher.extract(small), small, image)
 
-        return self._frames.get(_sized(key, longer_side), look)
+        return _kept(self._frames, _sized(key, longer_side), look)
 
 
 @dataclass(frozen=True)
@@ -204,6 +204,16 @@ def _size(image: np.ndarray) -> tuple[int, int]:
 
 def _seen(features: Features, matched: np.ndarray, given: np.ndarray) -> _Seen:
     return _Seen(features, cv2.cvtColor(matched, cv2.COLOR_RGB2GRAY), np.divide(_size(matched), _size(given)))
+
+
+def _kept(cache: LRUCache[Hashable, _Seen], key: Hashable | None, look: Callable[[], _Seen]) -> _Seen:
+    """What the cache has under a key, put there where it has nothing; nothing is put under None."""
+    seen = cache.get(key)
+    if seen is None:
+        seen = look()
+        if key is not None and cache.maxsize > 0:
+            cache[key] = seen
+    return seen
 
 
 def _sized(frame_key: Hashable | None, longer_side: int) -> Hashable | None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from cachetools import FIFOCache
 
 from fieldpose.bus.messages import GuessReason, TrackingState
 from fieldpose.stages.geometry import perturb
@@ -149,7 +149,7 @@ class PerturbedTruthPolicy(EachFramePolicy):
         disturbance: Disturbance,
         retrieved: Callable[[FrameInfo], Poses] = lambda frame: (),
     ) -> None:
-        self._known: OrderedDict[int, np.ndarray] = OrderedDict()
+        self._known: FIFOCache[int, np.ndarray] = FIFOCache(_TRUTHS_KEPT)
         super().__init__(config, views, self._known, retrieved)
         self._disturbance = disturbance
 
@@ -160,5 +160,3 @@ class PerturbedTruthPolicy(EachFramePolicy):
         rng = np.random.default_rng([self._config.seed, frame_id])
         disturbance = self._disturbance
         self._known[frame_id] = perturb(cam_from_object, rng, disturbance.angle_deg, disturbance.max_translation)
-        if len(self._known) > _TRUTHS_KEPT:
-            self._known.popitem(last=False)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 
 import numpy as np
+from cachetools import FIFOCache
 
 from fieldpose.stages.tracking.policy import FrameInfo
 
@@ -18,15 +18,12 @@ class RetrievedPoses:
     """cam_from_object (4, 4) of training views by frame, the most alike first."""
 
     def __init__(self) -> None:
-        self._poses: OrderedDict[tuple[int, int], Poses] = OrderedDict()
+        self._poses: FIFOCache[tuple[int, int], Poses] = FIFOCache(_KEPT)
 
     def add(self, frame_id: int, capture_ns: int, poses: Poses) -> None:
         """Take in what was found for a frame, unless that is nothing; the longest known is forgotten."""
-        if not poses:
-            return
-        self._poses[frame_id, capture_ns] = poses
-        while len(self._poses) > _KEPT:
-            self._poses.popitem(last=False)
+        if poses:
+            self._poses[frame_id, capture_ns] = poses
 
     def of(self, frame: FrameInfo) -> Poses:
         """For this frame; nothing where it is not known (yet)."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Iterator
 from itertools import islice
 from typing import cast
 
 import numpy as np
+from cachetools import FIFOCache
 
 from fieldpose.bus.errors import RecordingError
 from fieldpose.bus.messages import Frame, Truth
@@ -50,12 +51,10 @@ def _frames(path: str, size: int | None) -> Iterator[CapturedFrame]:
 def _with_truths(path: str) -> Iterator[tuple[Frame, Truth | None]]:
     """Each frame with its truth, which may stand a little before or after it in the file."""
     waiting: deque[Frame] = deque()
-    truths: OrderedDict[int, Truth] = OrderedDict()
+    truths: FIFOCache[int, Truth] = FIFOCache(_TRUTHS_KEPT)
     for recorded in _messages(path):
         if recorded.topic is TRUTH:
             truths[recorded.message.header.frame_id] = cast(Truth, recorded.message)
-            if len(truths) > _TRUTHS_KEPT:
-                truths.popitem(last=False)
         else:
             waiting.append(cast(Frame, recorded.message))
         while waiting and (waiting[0].header.frame_id in truths or len(waiting) > _TRUTH_MAY_LAG):

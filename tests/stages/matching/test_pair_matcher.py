@@ -100,6 +100,15 @@ def test_kept_features_are_bounded() -> None:
     assert len(matcher.extracted) == 102
 
 
+def test_no_view_is_kept_where_there_is_room_for_none() -> None:
+    matcher = Corners()
+    pairs = PairMatcher(matcher, MatchingConfig(kept_views=0))
+    image, solid = picture(0, 64), np.ones((64, 64), np.float32)
+    for _ in range(2):
+        pairs.match(image, solid, image, "view", "frame")
+    assert len(matcher.extracted) == 3
+
+
 def test_a_large_frame_is_matched_at_the_views_size_and_answered_in_its_own_pixels() -> None:
     matcher = Corners()
     frame = np.zeros((480, 640, 3), np.uint8)

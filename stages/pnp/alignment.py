@@ -100,18 +100,18 @@ class Aligner:
         if most is not None:
             index = index[:: max(1, -(-len(index) // most))]
         places, similarity = np.empty((len(index), 2), np.float32), np.empty(len(index), np.float32)
-        spread = np.empty((len(index), 2, 2), np.float32)
+        covariance = np.empty((len(index), 2, 2), np.float32)
         find_patches(
             self._view[level], self._frame[level], (self._pixels[index] * smaller).astype(np.float32), warps[index],
-            starts[index] * smaller, config.align_half, config.align_steps, places, similarity, spread,
+            starts[index] * smaller, config.align_half, config.align_steps, places, similarity, covariance,
         )  # fmt: skip
         places /= smaller
         inside = ((places >= 0) & (places <= (width - 1, height - 1))).all(axis=1)
         found = inside & (similarity > config.align_similarity)
         pixels = unscale_pixels(places[found].astype(np.float64), self._scale)
         # In pixels of the view, of which the frame's are all the same multiple.
-        spread = spread[found].astype(np.float64) * 4**level
-        return Placed(index[found], pixels, np.linalg.inv(spread + config.align_floor_px**2 * np.eye(2)), seen)
+        covariance = covariance[found].astype(np.float64) * 4**level
+        return Placed(index[found], pixels, np.linalg.inv(covariance + config.align_floor_px**2 * np.eye(2)), seen)
 
 
 def inverse_depth_slopes(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:

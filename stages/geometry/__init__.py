@@ -1,4 +1,4 @@
-"""Cameras, rigid transforms, pose errors and random poses: what every stage shares."""
+"""Cameras, rigid transforms, pose errors, limits and random poses: what every stage shares."""
 
 from fieldpose.stages.geometry.cameras import (
     Camera,
@@ -10,9 +10,11 @@ from fieldpose.stages.geometry.cameras import (
 )
 from fieldpose.stages.geometry.errors import mahalanobis_squared, rotation_error_deg, translation_error, viewing_angles
 from fieldpose.stages.geometry.jacobians import image_jacobian, twist_gradient
+from fieldpose.stages.geometry.limits import Limit, pairwise
 from fieldpose.stages.geometry.rigid import (
     adjoint,
     camera_centre,
+    camera_centres,
     exp_se3,
     interpolate,
     inverse,
@@ -27,8 +29,10 @@ from fieldpose.stages.geometry.uncertainty import twist_covariance
 
 __all__ = [
     "Camera",
+    "Limit",
     "adjoint",
     "camera_centre",
+    "camera_centres",
     "exp_se3",
     "image_jacobian",
     "interpolate",
@@ -38,6 +42,7 @@ __all__ = [
     "look_at",
     "mahalanobis_squared",
     "nearest_rigid",
+    "pairwise",
     "perturb",
     "points_at_depth",
     "rays",

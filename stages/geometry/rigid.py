@@ -120,6 +120,11 @@ def camera_centre(cam_from_object: np.ndarray) -> np.ndarray:
     return -cam_from_object[:3, :3].T @ cam_from_object[:3, 3]
 
 
+def camera_centres(cam_from_object: np.ndarray) -> np.ndarray:
+    """camera_centre of each of several poses (n, 4, 4): (n, 3)."""
+    return -np.einsum("nji,nj->ni", cam_from_object[:, :3, :3], cam_from_object[:, :3, 3])
+
+
 def _unit(vector: ArrayLike, what: str) -> np.ndarray:
     values = np.asarray(vector, dtype=np.float64)
     length = float(np.linalg.norm(values))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fieldpose.stages.tracking.distance import Limit
+from fieldpose.stages.geometry import Limit
 
 _ELSEWHERE_DEG, _ELSEWHERE = 10.0, 0.2
 """So far from where its view was, in degrees or x scale, a pose errs as on any scene."""
@@ -26,6 +26,6 @@ class Certainty:
         """The covariance (6, 6) of a pose (4, 4) that was found from a view rendered at `guess`."""
         if covariance is None:
             return None
-        apart = min(self._elsewhere.of(guess, pose), 1.0)
+        apart = min(self._elsewhere.distance_ratio(guess, pose), 1.0)
         scaled: np.ndarray = covariance * (self._factor * (1 - apart) + apart)
         return scaled

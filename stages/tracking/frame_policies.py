@@ -9,10 +9,9 @@ import numpy as np
 from cachetools import FIFOCache
 
 from fieldpose.bus.messages import GuessReason, TrackingState
-from fieldpose.stages.geometry import perturb
+from fieldpose.stages.geometry import Limit, perturb
 from fieldpose.stages.tracking.certainty import Certainty
 from fieldpose.stages.tracking.config import TrackingConfig
-from fieldpose.stages.tracking.distance import Limit
 from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
 from fieldpose.stages.tracking.retrieved import Poses
 from fieldpose.stages.tracking.scoring import believed, score

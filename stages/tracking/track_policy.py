@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from fieldpose.bus.messages import GuessReason, TrackingState
+from fieldpose.stages.geometry import Limit
 from fieldpose.stages.tracking.certainty import Certainty
 from fieldpose.stages.tracking.config import TrackingConfig
-from fieldpose.stages.tracking.distance import Limit
 from fieldpose.stages.tracking.motion import NS_PER_MS, MotionModel
 from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
 from fieldpose.stages.tracking.retrieved import RetrievedPoses

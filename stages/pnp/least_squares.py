@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.geometry import Camera, image_jacobian
+from fieldpose.stages.kernel_cache import cached_njit
 
 _MAX_STEPS = 20
 CONVERGED = 1e-5
@@ -106,7 +107,7 @@ def project_normalised(pose: np.ndarray, point: np.ndarray) -> tuple[float, floa
     return u, v, z
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def weighted_lengths(
     pixels: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray, weights: np.ndarray,
     out: np.ndarray,
@@ -122,7 +123,7 @@ def weighted_lengths(
         out[i] = math.sqrt(weights[i, 0, 0] * x * x + 2 * weights[i, 0, 1] * x * y + weights[i, 1, 1] * y * y)
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def normal_equations(
     pixels: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray, weights: np.ndarray,
     delta: float, gradient: np.ndarray, hessian: np.ndarray,
@@ -158,7 +159,7 @@ def normal_equations(
             hessian[b, a] = hessian[a, b]
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def huber_delta(lengths: np.ndarray) -> float:
     """Up to which length of weighted residuals (n,) Huber's loss is quadratic."""
     middle = lengths.shape[0] // 2
@@ -197,7 +198,7 @@ def exp_se3_times(step: np.ndarray, pose: np.ndarray, out: np.ndarray) -> None:
     out[3] = pose[3]
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def levenberg_marquardt(
     pixels: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, weights: np.ndarray, distance: float,
     converged: float, pose: np.ndarray,

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.kernel_cache import cached_njit
 
 _LEAST_CONTRAST = np.float32(1e-3)
 _LEAST_TEXTURE = 1e-5
@@ -93,7 +94,7 @@ def _window(half: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return x_offset, y_offset, weight
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def find_patches(
     first: np.ndarray,
     second: np.ndarray,

@@ -104,11 +104,10 @@ def weights() -> Iterator[Finding]:
 
 def kernels() -> Iterator[Finding]:
     """Whether the field's kernels are compiled already."""
-    from numba import config
+    from fieldpose.stages.kernel_cache import cache_folder
+    from fieldpose.stages.nerf import kernels
 
-    import fieldpose.stages.nerf.kernels  # noqa: F401 (says where the cache is)
-
-    folder = Path(config.CACHE_DIR)
+    folder = cache_folder(Path(kernels.__file__).parent)
     compiled = len(list(folder.rglob("*.nbi")))
     detail = f"{compiled} compiled, in {folder}" if compiled else "not compiled yet"
     mend = "" if compiled else "the first start takes half a minute longer"

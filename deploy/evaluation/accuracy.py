@@ -10,11 +10,17 @@ from scipy.stats import chi2
 
 from fieldpose.deploy.local import photo_finder
 from fieldpose.deploy.settings import Settings
-from fieldpose.stages.geometry import Camera, mahalanobis_squared, rotation_error_deg, translation_error
+from fieldpose.stages.geometry import (
+    Camera,
+    Limit,
+    mahalanobis_squared,
+    pairwise,
+    rotation_error_deg,
+    translation_error,
+)
 from fieldpose.stages.nerf.metadata import PoseAccuracy
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 from fieldpose.stages.nerf.training_views import TrainingViews
-from fieldpose.stages.tracking.distance import Limit, pairwise
 
 _IMAGES = 32
 _ENOUGH = 8

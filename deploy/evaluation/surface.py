@@ -68,8 +68,7 @@ def surface_of(renderer: RayRenderer, cameras: Sequence[TrainingCamera], rng: np
 
 
 def _seen_by(renderer: RayRenderer, view: TrainingCamera) -> np.ndarray:
-    camera, pose = view.camera.undistorted(), view.pose
-    camera = camera.scaled(min(1.0, _SIZE / max(camera.width, camera.height)))
+    camera, pose = view.camera.undistorted().shrunk(_SIZE), view.pose
     rendered = renderer.render_view(camera, pose)
     y, x = np.nonzero((rendered.opacity > 0.5) & (rendered.depth > 0))
     return points_at_depth(camera, pose, np.stack([x, y], axis=1), rendered.depth[y, x])

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
-import cv2
-import msgspec
 import numpy as np
 
 from fieldpose.bus.messages import Frame
@@ -17,8 +15,9 @@ from fieldpose.bus.topics import FRAME
 from fieldpose.deploy.reporting.overlay import VideoFile, captioned, overlaid, without_distortion
 from fieldpose.deploy.reporting.results import FrameResult
 from fieldpose.errors import OutputError
-from fieldpose.stages.geometry import Camera
+from fieldpose.stages.images import shrunk_with_camera
 from fieldpose.stages.nerf.rendering_api import RayRenderer
+from fieldpose.stages.wire import frame_image
 
 _VIDEO_HZ = 30.0
 _WIDEST = 480
@@ -82,11 +81,9 @@ def _repeats(picture: Picture, following: Picture) -> int:
 
 
 def _picture(frame: Frame, result: FrameResult, renderer: RayRenderer) -> Picture:
-    camera = Camera(**msgspec.structs.asdict(frame.camera))
+    camera = frame.camera
     image = without_distortion(_decoded(frame), camera)
-    factor = min(1.0, _WIDEST / max(camera.width, camera.height))
-    small = camera.undistorted().scaled(factor)
-    image = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    image, small = shrunk_with_camera(image, camera.undistorted(), _WIDEST)
     over = image
     if result.cam_from_object is not None:
         over = overlaid(image, renderer.render_view(small, result.cam_from_object))
@@ -103,9 +100,7 @@ def _caption(result: FrameResult) -> list[str]:
 
 
 def _decoded(frame: Frame) -> np.ndarray:
-    if frame.encoding == "rgb8":
-        return frame.image
-    bgr = cv2.imdecode(frame.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if bgr is None:
+    image = frame_image(frame)
+    if image is None:
         raise OutputError(f"frame {frame.header.frame_id} of the recording cannot be decoded")
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    return image

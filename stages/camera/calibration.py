@@ -7,9 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import msgspec
-import numpy as np
 from PIL import Image
 
 from fieldpose.bus.messages import CameraOrigin
@@ -91,15 +89,6 @@ def focal_length_from_exif(path: Path, width: int, height: int) -> float | None:
     except (OSError, ValueError, TypeError, SyntaxError):
         return None
     return focal_mm / _DIAGONAL_35MM * math.hypot(width, height) if focal_mm > 0 else None
-
-
-def shrunk(image: np.ndarray, camera: Camera, size: int | None) -> tuple[np.ndarray, Camera]:
-    """An RGB image (h, w, 3) and its camera, with the longer side at most `size`, averaged over areas."""
-    longer = max(camera.width, camera.height)
-    if size is None or longer <= size:
-        return image, camera
-    smaller = camera.scaled(size / longer)
-    return cv2.resize(image, (smaller.width, smaller.height), interpolation=cv2.INTER_AREA), smaller
 
 
 def _centred(width: int, height: int, focal: float) -> Camera:

@@ -1,10 +1,20 @@
-"""Cameras, rigid transforms, pose errors and random poses: what every stage shares."""
+"""Cameras, rigid transforms, pose errors, limits and random poses: what every stage shares."""
 
-from fieldpose.stages.geometry.cameras import Camera, points_at_depth, rays
+from fieldpose.stages.geometry.cameras import (
+    Camera,
+    points_at_depth,
+    rays,
+    scale_pixels,
+    shrunk_size,
+    unscale_pixels,
+)
 from fieldpose.stages.geometry.errors import mahalanobis_squared, rotation_error_deg, translation_error, viewing_angles
+from fieldpose.stages.geometry.jacobians import image_jacobian, twist_gradient
+from fieldpose.stages.geometry.limits import Limit, pairwise
 from fieldpose.stages.geometry.rigid import (
     adjoint,
     camera_centre,
+    camera_centres,
     exp_se3,
     interpolate,
     inverse,
@@ -19,9 +29,12 @@ from fieldpose.stages.geometry.uncertainty import twist_covariance
 
 __all__ = [
     "Camera",
+    "Limit",
     "adjoint",
     "camera_centre",
+    "camera_centres",
     "exp_se3",
+    "image_jacobian",
     "interpolate",
     "inverse",
     "is_rigid",
@@ -29,12 +42,17 @@ __all__ = [
     "look_at",
     "mahalanobis_squared",
     "nearest_rigid",
+    "pairwise",
     "perturb",
     "points_at_depth",
     "rays",
     "rotation_about",
     "rotation_error_deg",
+    "scale_pixels",
+    "shrunk_size",
     "translation_error",
     "twist_covariance",
+    "twist_gradient",
+    "unscale_pixels",
     "viewing_angles",
 ]

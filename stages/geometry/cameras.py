@@ -5,6 +5,8 @@ Axes are OpenCV's (x right, y down, z forward); pixel (0, 0) is the centre of th
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import msgspec
 import numpy as np
 
@@ -14,6 +16,7 @@ _LARGEST = 16384
 _UNDISTORTED = (0.0, 0.0, 0.0, 0.0, 0.0)
 _NEWTON_STEPS = 25
 _INVERSE_TOLERANCE_PX = 1e-4
+_Pixels = TypeVar("_Pixels", float, np.ndarray)
 
 
 class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -44,12 +47,13 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def resized(self, width: int, height: int) -> Camera:
         """The camera of this image resized to (width, height); a pixel's area is scaled, not its centre."""
         sx, sy = width / self.width, height / self.height
-        cx, cy = (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5
+        cx, cy = scale_pixels(self.cx, sx), scale_pixels(self.cy, sy)
         return msgspec.structs.replace(self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=cx, cy=cy)
 
-    def scaled(self, factor: float) -> Camera:
-        """resized() by a factor, to the nearest whole size."""
-        return self.resized(max(1, round(self.width * factor)), max(1, round(self.height * factor)))
+    def shrunk(self, longer_side: int) -> Camera:
+        """resized() to shrunk_size(); the camera itself where its image is no larger."""
+        size = shrunk_size(self.width, self.height, longer_side)
+        return self if size == (self.width, self.height) else self.resized(*size)
 
     def undistorted(self) -> Camera:
         """The same camera without distortion."""
@@ -116,6 +120,22 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 break
             ideal -= _solve_2x2(jacobian, determinant, residual)
         return ideal, usable
+
+
+def shrunk_size(width: int, height: int, longer_side: int) -> tuple[int, int]:
+    """Width and height, the longer at most `longer_side`, to the nearest whole numbers and never 0."""
+    factor = min(1.0, longer_side / max(width, height))
+    return max(1, round(width * factor)), max(1, round(height * factor))
+
+
+def scale_pixels(pixels: _Pixels, scale: _Pixels) -> _Pixels:
+    """Where pixels are once their image is resized; scale: new size / old size. Both along one axis, or (..., 2)."""
+    return (pixels + 0.5) * scale - 0.5
+
+
+def unscale_pixels(pixels: _Pixels, scale: _Pixels) -> _Pixels:
+    """Where pixels of the resized image were before: the inverse of scale_pixels."""
+    return (pixels + 0.5) / scale - 0.5
 
 
 def distort(ideal: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:

@@ -7,17 +7,19 @@ write it in a file of this folder beside the others and name it in `MATCHERS`; n
 from __future__ import annotations
 
 import importlib
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
+from cachetools import LRUCache
 
 from fieldpose.bus.messages import Reason
 from fieldpose.errors import ConfigError
-from fieldpose.stages.last_used import LastUsed
+from fieldpose.stages.geometry import shrunk_size, unscale_pixels
+from fieldpose.stages.images import shrunk
 from fieldpose.stages.matching.subpixel import align_patches
 
 MATCHERS = {
@@ -31,8 +33,6 @@ MATCHERS = {
 """Name in the configuration -> module and the callable in it that makes a Matcher of a MatchingConfig."""
 
 _KEPT_FRAMES = 2
-_WHOLE = np.ones(2, np.float32)
-_WHOLE.setflags(write=False)
 
 
 @dataclass(frozen=True)
@@ -127,22 +127,14 @@ def visible_mask(opacity: np.ndarray, erode_px: int) -> np.ndarray:
     return eroded.astype(bool)
 
 
-def shrink(image: np.ndarray, longer_side: int) -> tuple[np.ndarray, np.ndarray]:
-    """An image (h, w, 3) with its longer side at most `longer_side`, and its (x, y) scale: new size / old size."""
-    size, (height, width) = _shrunk_size(image, longer_side), image.shape[:2]
-    if size == (width, height):
-        return image, _WHOLE
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.array(size, np.float32) / (width, height)
-
-
 class PairMatcher:
     """Matches views with frames and keeps the features of the last ones, for views and frames that come again."""
 
     def __init__(self, matcher: Matcher, config: MatchingConfig, at_once: bool = True) -> None:
         """at_once: two new images in one go, which is faster, and rounds otherwise than one after the other."""
         self._matcher, self._config, self._at_once = matcher, config, at_once
-        self._views: LastUsed[_Seen] = LastUsed(config.kept_views)
-        self._frames: LastUsed[_Seen] = LastUsed(_KEPT_FRAMES)
+        self._views: LRUCache[Hashable, _Seen] = LRUCache(config.kept_views)
+        self._frames: LRUCache[Hashable, _Seen] = LRUCache(_KEPT_FRAMES)
 
     def match(
         self,
@@ -167,7 +159,7 @@ class PairMatcher:
             window = self._config.patch_px
             pixels_b, factor = align_patches(view.grey, frame.grey, matched.pixels_a, pixels_b, window)
             confidence = confidence * factor
-        in_frame = ((pixels_b + 0.5) / frame.scale - 0.5).astype(np.float32)
+        in_frame = unscale_pixels(pixels_b, frame.scale).astype(np.float32)
         return MatchedPixels(matched.pixels_a, in_frame, confidence)
 
     def view_features(self, rgb: np.ndarray, opacity: np.ndarray, view_key: Hashable) -> Features:
@@ -183,27 +175,27 @@ class PairMatcher:
         view_key: Hashable | None, frame_key: Hashable | None,
     ) -> tuple[_Seen, _Seen]:  # fmt: skip
         sized_key = _sized(frame_key, longer_side)
-        alike = _shrunk_size(frame_image, longer_side) == (rgb.shape[1], rgb.shape[0])
+        alike = shrunk_size(*_size(frame_image), longer_side) == _size(rgb)
         new = view_key not in self._views and sized_key not in self._frames
         if self._at_once and alike and new and isinstance(self._matcher, ExtractsAtOnce):
-            mask, (small, scale) = visible_mask(opacity, self._config.erode_px), shrink(frame_image, longer_side)
+            mask, small = visible_mask(opacity, self._config.erode_px), shrunk(frame_image, longer_side)
             in_view, in_frame = self._matcher.extract_all([(rgb, mask), (small, None)])
-            view = self._views.get(view_key, lambda: _seen(in_view, rgb))
-            return view, self._frames.get(sized_key, lambda: _seen(in_frame, small, scale))
+            view = _kept(self._views, view_key, lambda: _seen(in_view, rgb, rgb))
+            return view, _kept(self._frames, sized_key, lambda: _seen(in_frame, small, frame_image))
         return self._view(rgb, opacity, view_key), self._frame(frame_image, longer_side, frame_key)
 
     def _view(self, rgb: np.ndarray, opacity: np.ndarray, key: Hashable | None) -> _Seen:
         def look() -> _Seen:
-            return _seen(self._matcher.extract(rgb, visible_mask(opacity, self._config.erode_px)), rgb)
+            return _seen(self._matcher.extract(rgb, visible_mask(opacity, self._config.erode_px)), rgb, rgb)
 
-        return self._views.get(key, look)
+        return _kept(self._views, key, look)
 
     def _frame(self, image: np.ndarray, longer_side: int, key: Hashable | None) -> _Seen:
         def look() -> _Seen:
-            small, scale = shrink(image, longer_side)
-            return _seen(self._matcher.extract(small), small, scale)
+            small = shrunk(image, longer_side)
+            return _seen(self._matcher.extract(small), small, image)
 
-        return self._frames.get(_sized(key, longer_side), look)
+        return _kept(self._frames, _sized(key, longer_side), look)
 
 
 @dataclass(frozen=True)
@@ -215,15 +207,23 @@ class _Seen:
     scale: np.ndarray
 
 
-def _shrunk_size(image: np.ndarray, longer_side: int) -> tuple[int, int]:
+def _size(image: np.ndarray) -> tuple[int, int]:
     """Width and height."""
-    height, width = image.shape[:2]
-    factor = min(1.0, longer_side / max(height, width))
-    return max(1, round(width * factor)), max(1, round(height * factor))
+    return image.shape[1], image.shape[0]
 
 
-def _seen(features: Features, image: np.ndarray, scale: np.ndarray = _WHOLE) -> _Seen:
-    return _Seen(features, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), scale)
+def _seen(features: Features, matched: np.ndarray, given: np.ndarray) -> _Seen:
+    return _Seen(features, cv2.cvtColor(matched, cv2.COLOR_RGB2GRAY), np.divide(_size(matched), _size(given)))
+
+
+def _kept(cache: LRUCache[Hashable, _Seen], key: Hashable | None, look: Callable[[], _Seen]) -> _Seen:
+    """What the cache has under a key, put there where it has nothing; nothing is put under None."""
+    seen = cache.get(key)
+    if seen is None:
+        seen = look()
+        if key is not None and cache.maxsize > 0:
+            cache[key] = seen
+    return seen
 
 
 def _sized(frame_key: Hashable | None, longer_side: int) -> Hashable | None:

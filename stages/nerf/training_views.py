@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from fieldpose.errors import ConfigError
+from fieldpose.stages.geometry import camera_centres
 from fieldpose.stages.nerf.datasets import find_name
 from fieldpose.stages.nerf.field import DESCRIBED_SIZE, Field
-from fieldpose.stages.tracking.distance import centres_of
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class TrainingViews:
         """The spread of the cameras (median distance to their mean) in object units; 1 for fewer than two."""
         if len(self.cam_from_object) < 2:
             return 1.0
-        centres = centres_of(self.cam_from_object)
+        centres = camera_centres(self.cam_from_object)
         spread = float(np.median(np.linalg.norm(centres - centres.mean(axis=0), axis=1)))
         return spread if spread > 1e-9 else 1.0
 

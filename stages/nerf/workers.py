@@ -10,12 +10,14 @@ from itertools import count
 from threading import Lock
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from fieldpose.stages.nerf.blas import SingleThreadedBlas
 from fieldpose.stages.nerf.config import FieldConfig
 from fieldpose.stages.nerf.kernels.encoding import LANES
 from fieldpose.stages.nerf.kernels.types import SH_SIZE, Rays, Samples
 from fieldpose.stages.nerf.kernels.vectors import BLOCK
+
+BLAS = SingleThreadedBlas()
 
 
 def new_samples(config: FieldConfig, rows: int, backward: bool) -> Samples:
@@ -87,12 +89,13 @@ class Scratch:
 class Workers:
     """A pool of `threads` (0: one a core); kernels release the interpreter lock, so plain threads run them.
 
-    The matrix products inside the kernels then must not start threads of their own: BLAS is held to one.
+    The matrix products inside the kernels then must not start threads of their own: BLAS is held to one, until the
+    workers are closed or garbage collected.
     """
 
     def __init__(self, config: FieldConfig, threads: int, packet: int, rows: int, backward: bool):
         self.threads = threads or os.cpu_count() or 1
-        self._limits = threadpool_limits(limits=1, user_api="blas")
+        self._release_blas = BLAS.hold(self)
         self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
         self.scratch = [
             Scratch(i, new_samples(config, rows, backward), new_rays(config, packet)) for i in range(self.threads)
@@ -128,3 +131,4 @@ class Workers:
         """End the threads."""
         if self._pool is not None:
             self._pool.shutdown()
+        self._release_blas()

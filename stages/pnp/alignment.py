@@ -15,7 +15,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from fieldpose.stages.geometry import Camera, inverse
+from fieldpose.stages.geometry import Camera, inverse, unscale_pixels
+from fieldpose.stages.images import shrunk_with_camera
 from fieldpose.stages.pnp.config import PnpConfig
 from fieldpose.stages.pnp.least_squares import intrinsics_of
 from fieldpose.stages.pnp.patches import find_patches
@@ -67,7 +68,8 @@ class Aligner:
 
     def __init__(self, pictures: Pictures, points: np.ndarray, camera: Camera, config: PnpConfig) -> None:
         self._view_camera, self._view_pose, self._config = pictures.camera, pictures.cam_from_object, config
-        frame, self._camera = _shrunk(pictures.frame, camera, max(pictures.grey.shape))
+        grey = cv2.cvtColor(pictures.frame, cv2.COLOR_RGB2GRAY)
+        frame, self._camera = shrunk_with_camera(grey, camera, max(pictures.grey.shape))
         levels = max(config.align_levels, 1)
         self._view, self._frame = _pyramid(pictures.grey, levels), _pyramid(frame, levels)
         self._scale = np.array([self._camera.width / camera.width, self._camera.height / camera.height])
@@ -98,18 +100,18 @@ class Aligner:
         if most is not None:
             index = index[:: max(1, -(-len(index) // most))]
         places, similarity = np.empty((len(index), 2), np.float32), np.empty(len(index), np.float32)
-        spread = np.empty((len(index), 2, 2), np.float32)
+        covariance = np.empty((len(index), 2, 2), np.float32)
         find_patches(
             self._view[level], self._frame[level], (self._pixels[index] * smaller).astype(np.float32), warps[index],
-            starts[index] * smaller, config.align_half, config.align_steps, places, similarity, spread,
+            starts[index] * smaller, config.align_half, config.align_steps, places, similarity, covariance,
         )  # fmt: skip
         places /= smaller
         inside = ((places >= 0) & (places <= (width - 1, height - 1))).all(axis=1)
         found = inside & (similarity > config.align_similarity)
-        pixels = (places[found].astype(np.float64) + 0.5) / self._scale - 0.5
+        pixels = unscale_pixels(places[found].astype(np.float64), self._scale)
         # In pixels of the view, of which the frame's are all the same multiple.
-        spread = spread[found].astype(np.float64) * 4**level
-        return Placed(index[found], pixels, np.linalg.inv(spread + config.align_floor_px**2 * np.eye(2)), seen)
+        covariance = covariance[found].astype(np.float64) * 4**level
+        return Placed(index[found], pixels, np.linalg.inv(covariance + config.align_floor_px**2 * np.eye(2)), seen)
 
 
 def inverse_depth_slopes(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
@@ -136,15 +138,6 @@ def inverse_depth_slopes(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 def _inverse(depth: np.ndarray) -> np.ndarray:
     return np.where(depth > 0, 1 / np.maximum(depth, 1e-9), 0)
-
-
-def _shrunk(image: np.ndarray, camera: Camera, longer_side: int) -> tuple[np.ndarray, Camera]:
-    """A frame's grey values and its camera, no larger than the view."""
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    small = camera.scaled(min(1.0, longer_side / max(camera.width, camera.height)))
-    if small == camera:
-        return grey, camera
-    return cv2.resize(grey, (small.width, small.height), interpolation=cv2.INTER_AREA), small
 
 
 def _pyramid(grey: np.ndarray, levels: int) -> list[np.ndarray]:

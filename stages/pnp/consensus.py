@@ -14,7 +14,7 @@ import poselib
 from fieldpose.stages.geometry import Camera, is_rigid
 from fieldpose.stages.pnp.alignment import Aligner
 from fieldpose.stages.pnp.config import PnpConfig
-from fieldpose.stages.pnp.least_squares import CONVERGED, PoseFit, alike_in_all_directions, distances_px, fit_pose
+from fieldpose.stages.pnp.least_squares import CONVERGED, PoseFit, fit_pose, isotropic, reprojection_errors_px
 
 MIN_POINTS = 4
 _ROUNDS = 3
@@ -71,12 +71,12 @@ def agreed_pose(
     index, plain = np.flatnonzero(usable), camera.undistorted()
     if len(index) < MIN_POINTS:
         return None
-    pixels, alike = pixels[index], alike_in_all_directions(weights[index])
+    pixels, matrices = pixels[index], isotropic(weights[index])
     threshold = config.threshold_px * max(camera.width, camera.height) / _REFERENCE_SIDE_PX
-    start = _best_start(pixels, points[index], plain, threshold, config)
+    start = _ransac(pixels, points[index], plain, threshold, config)
     if start is None:
         return None
-    fit, inliers = _polish(pixels, points[index], plain, start, alike, threshold, config)
+    fit, inliers = _local_optimisation(pixels, points[index], plain, start, matrices, threshold, config)
     if fit is None or inliers.sum() < config.min_inlier_ratio * len(points):
         return None
     index = index[inliers]
@@ -138,7 +138,7 @@ def _aligned(
         placed = aligner.place(found.fit.cam_from_object, level, None if last else _ENOUGH)
         pixels, usable = camera.without_distortion(placed.pixels)  # a search may end where the lens has no inverse
         index, pixels = placed.index[usable], pixels[usable]
-        fit, inliers = _polish(
+        fit, inliers = _local_optimisation(
             pixels, points[index], camera.undistorted(), found.fit.cam_from_object, placed.weights[usable], spread_px,
             config, CONVERGED if last else _NEAR_ENOUGH,
         )  # fmt: skip
@@ -150,7 +150,7 @@ def _aligned(
     return found if rms <= config.align_spread * rounds[-1][1] else None
 
 
-def _best_start(
+def _ransac(
     pixels: np.ndarray, points: np.ndarray, camera: Camera, threshold: float, config: PnpConfig
 ) -> np.ndarray | None:
     """The pose that most correspondences agree on, or None.
@@ -171,7 +171,7 @@ def _best_start(
     return pose if about["num_inliers"] >= MIN_POINTS and is_rigid(pose) else None
 
 
-def _polish(
+def _local_optimisation(
     pixels: np.ndarray,
     points: np.ndarray,
     camera: Camera,
@@ -184,7 +184,7 @@ def _polish(
     """Fit the inliers and choose them anew by the fit, in turn; None where they become too few."""
     pose, fit, inliers = cam_from_object, None, np.zeros(len(pixels), bool)
     for _ in range(_ROUNDS):
-        agreeing = distances_px(pixels, points, camera, pose) <= threshold
+        agreeing = reprojection_errors_px(pixels, points, camera, pose) <= threshold
         if agreeing.sum() < max(config.min_inliers, MIN_POINTS):
             return None, agreeing
         if fit is not None and np.array_equal(agreeing, inliers):

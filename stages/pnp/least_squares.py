@@ -9,7 +9,8 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
-from fieldpose.stages.geometry import Camera
+from fieldpose.stages.geometry import Camera, image_jacobian
+from fieldpose.stages.kernel_cache import cached_njit
 
 _MAX_STEPS = 20
 CONVERGED = 1e-5
@@ -47,7 +48,7 @@ class PoseFit:
 
 def _huber_variance(lengths: np.ndarray) -> float:
     """Of residuals of these lengths (n,) as Huber's loss sees them; Huber, Robust Statistics (1981), section 7.6."""
-    delta = huber_width(lengths)
+    delta = huber_delta(lengths)
     freedom = max(2 * len(lengths) - 6, 1)
     slope = np.where(lengths <= delta, 1.0, delta / (2 * np.maximum(lengths, 1e-12))).mean()
     return float((np.minimum(lengths, delta) ** 2).sum() / freedom / slope**2)
@@ -70,19 +71,21 @@ def fit_pose(
     pixels, points, weights = (np.ascontiguousarray(given, np.float64) for given in (pixels, points, weights))
     distance = np.linalg.norm(np.median(points, axis=0) @ cam_from_object[:3, :3].T + cam_from_object[:3, 3])
     pose = np.array(cam_from_object, np.float64)
-    descend(pixels, points, intrinsics_of(camera), weights, max(float(distance), 1e-12), converged, pose)
+    levenberg_marquardt(pixels, points, intrinsics_of(camera), weights, max(float(distance), 1e-12), converged, pose)
     return PoseFit(pose, pixels, points, camera, weights)
 
 
-def distances_px(pixels: np.ndarray, points: np.ndarray, camera: Camera, cam_from_object: np.ndarray) -> np.ndarray:
+def reprojection_errors_px(
+    pixels: np.ndarray, points: np.ndarray, camera: Camera, cam_from_object: np.ndarray
+) -> np.ndarray:
     """Lengths (n,) of the reprojection errors; infinite behind the camera. Arrays as for fit_pose."""
-    lengths, plain = np.empty(len(points)), alike_in_all_directions(np.ones(len(points)))
+    lengths, plain = np.empty(len(points)), isotropic(np.ones(len(points)))
     pose = np.ascontiguousarray(cam_from_object, np.float64)
     weighted_lengths(pixels, points, intrinsics_of(camera), pose, plain, lengths)
     return lengths
 
 
-def alike_in_all_directions(weights: np.ndarray) -> np.ndarray:
+def isotropic(weights: np.ndarray) -> np.ndarray:
     """Weights (n,) as (n, 2, 2)."""
     matrices: np.ndarray = weights[:, None, None] * np.eye(2)
     return matrices
@@ -94,7 +97,7 @@ def intrinsics_of(camera: Camera) -> np.ndarray:
 
 
 @njit(inline="always")
-def ideal(pose: np.ndarray, point: np.ndarray) -> tuple[float, float, float]:
+def project_normalised(pose: np.ndarray, point: np.ndarray) -> tuple[float, float, float]:
     """Where a point is in an image of focal length 1, and its depth; where that is not positive, it alone counts."""
     p0, p1, p2 = point
     z = pose[2, 0] * p0 + pose[2, 1] * p1 + pose[2, 2] * p2 + pose[2, 3]
@@ -104,7 +107,7 @@ def ideal(pose: np.ndarray, point: np.ndarray) -> tuple[float, float, float]:
     return u, v, z
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def weighted_lengths(
     pixels: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray, weights: np.ndarray,
     out: np.ndarray,
@@ -112,7 +115,7 @@ def weighted_lengths(
     """Lengths out (n,) of reprojection errors by their weights (n, 2, 2); infinite behind the camera. All float64."""
     fx, fy, cx, cy = intrinsics
     for i in range(points.shape[0]):
-        u, v, z = ideal(pose, points[i])
+        u, v, z = project_normalised(pose, points[i])
         if z <= 0:
             out[i] = np.inf
             continue
@@ -120,7 +123,7 @@ def weighted_lengths(
         out[i] = math.sqrt(weights[i, 0, 0] * x * x + 2 * weights[i, 0, 1] * x * y + weights[i, 1, 1] * y * y)
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def normal_equations(
     pixels: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, pose: np.ndarray, weights: np.ndarray,
     delta: float, gradient: np.ndarray, hessian: np.ndarray,
@@ -134,7 +137,7 @@ def normal_equations(
     hessian[:] = 0
     rows = np.empty((2, 6))
     for i in range(points.shape[0]):
-        u, v, z = ideal(pose, points[i])
+        u, v, z = project_normalised(pose, points[i])
         if z <= 0:
             continue
         x, y = fx * u + cx - pixels[i, 0], fy * v + cy - pixels[i, 1]
@@ -156,8 +159,8 @@ def normal_equations(
             hessian[b, a] = hessian[a, b]
 
 
-@njit(nogil=True, cache=True)
-def huber_width(lengths: np.ndarray) -> float:
+@cached_njit(nogil=True)
+def huber_delta(lengths: np.ndarray) -> float:
     """Up to which length of weighted residuals (n,) Huber's loss is quadratic."""
     middle = lengths.shape[0] // 2
     return max(_HUBER * np.partition(lengths, middle)[middle] / _MEDIAN_TO_SIGMA, 1e-6)
@@ -173,7 +176,7 @@ def huber_cost(lengths: np.ndarray, delta: float) -> float:
 
 
 @njit(nogil=True)
-def turned(step: np.ndarray, pose: np.ndarray, out: np.ndarray) -> None:
+def exp_se3_times(step: np.ndarray, pose: np.ndarray, out: np.ndarray) -> None:
     """exp(step) @ pose (4, 4) into out, for a twist (6,); `exp_se3` is its plain twin."""
     w0, w1, w2 = step[3], step[4], step[5]
     squared = w0 * w0 + w1 * w1 + w2 * w2
@@ -195,8 +198,8 @@ def turned(step: np.ndarray, pose: np.ndarray, out: np.ndarray) -> None:
     out[3] = pose[3]
 
 
-@njit(nogil=True, cache=True)
-def descend(
+@cached_njit(nogil=True)
+def levenberg_marquardt(
     pixels: np.ndarray, points: np.ndarray, intrinsics: np.ndarray, weights: np.ndarray, distance: float,
     converged: float, pose: np.ndarray,
 ) -> None:  # fmt: skip
@@ -206,12 +209,12 @@ def descend(
     damping = 1e-6
     weighted_lengths(pixels, points, intrinsics, pose, weights, lengths)
     for _ in range(_MAX_STEPS):
-        delta = huber_width(lengths)
+        delta = huber_delta(lengths)
         normal_equations(pixels, points, intrinsics, pose, weights, delta, gradient, hessian)
         for i in range(6):
             hessian[i, i] = hessian[i, i] * (1 + damping) + 1e-12
         step = -np.linalg.solve(hessian, gradient)
-        turned(step, pose, moved)
+        exp_se3_times(step, pose, moved)
         weighted_lengths(pixels, points, intrinsics, moved, weights, moved_lengths)
         if huber_cost(moved_lengths, delta) <= huber_cost(lengths, delta):
             pose[:] = moved
@@ -232,11 +235,7 @@ def reprojection(
     x, y, z = in_cam.T
     inverse = 1 / np.where(z > 1e-9, z, 1e-9)
     u, v = x * inverse, y * inverse
-    zero = np.zeros_like(u)
-    jacobian = np.empty((len(points), 2, 6))
-    jacobian[:, 0] = np.stack([inverse, zero, -u * inverse, -u * v, 1 + u * u, -v], axis=1)
-    jacobian[:, 1] = np.stack([zero, inverse, -v * inverse, -1 - v * v, u * v, u], axis=1)
-    jacobian *= np.array([camera.fx, camera.fy])[:, None]
+    jacobian = image_jacobian(u, v, inverse) * np.array([camera.fx, camera.fy])[:, None]
     residuals = np.stack([camera.fx * u + camera.cx, camera.fy * v + camera.cy], axis=1) - pixels
     residuals[z <= 0] = np.inf
     return residuals, jacobian

@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.kernel_cache import cached_njit
 
 _LEAST_CONTRAST = np.float32(1e-3)
 _LEAST_TEXTURE = 1e-5
@@ -93,7 +94,7 @@ def _window(half: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return x_offset, y_offset, weight
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def find_patches(
     first: np.ndarray,
     second: np.ndarray,
@@ -104,19 +105,19 @@ def find_patches(
     steps: int,
     places: np.ndarray,
     similarity: np.ndarray,
-    spread: np.ndarray,
+    covariance: np.ndarray,
 ) -> None:
-    """Fill places (n, 2), where patches of the first image are in the second, their similarity (n,) and spread.
+    """Fill places (n, 2), where patches of the first image are in the second, their similarity (n,) and covariance.
 
     first, second: (h, w) float32.  centres (n, 2): pixels of the first, starts (n, 2): about where they are in the
     second.  first_from_second (n, 2, 2): how offsets from the one become offsets from the other.  A patch has
     2 half + 1 samples a side, a pixel of the second apart.  similarity: normalised correlation, weighted towards the
     middle, -1 to 1; -1 where the patch is too plain to be placed or the search leads away by three pixels or more
-    (the place is then the start). spread (n, 2, 2): covariance of the place by what is left of the patch's grey values,
-    taken to be noise: along an edge it is large. All float32.
+    (the place is then the start). covariance (n, 2, 2): of the place, by what is left of the patch's grey values, taken
+    to be noise: along an edge it is large. All float32.
     """
     if min(first.shape[0], first.shape[1], second.shape[0], second.shape[1]) < 2:
-        places[:], similarity[:], spread[:] = starts, -1, 0
+        places[:], similarity[:], covariance[:] = starts, -1, 0
         return
     side = 2 * half + 1
     count = side * side
@@ -129,7 +130,7 @@ def find_patches(
     for i in range(centres.shape[0]):
         places[i] = starts[i]
         similarity[i] = -1
-        spread[i] = 0
+        covariance[i] = 0
         a, b, c, d = first_from_second[i].flat
         for k in range(count):
             warped_x[k] = a * x_offset[k] + b * y_offset[k]
@@ -144,11 +145,11 @@ def find_patches(
             continue
         determinant = xx * yy - xy * xy
         x, y = starts[i]
-        alike = np.float32(-1)
+        correlation = np.float32(-1)
         for _ in range(steps):
             _sample(flat_there, second.shape[1], second.shape[0], x, y, x_offset, y_offset, other)
             contrast_there = max(math.sqrt(_centred(other, weight)), _LEAST_CONTRAST)
-            alike = _product(patch, other, weight) / (contrast * contrast_there)
+            correlation = _product(patch, other, weight) / (contrast * contrast_there)
             for k in range(count):
                 other[k] = other[k] * (contrast / contrast_there) - patch[k]
             pull_x, pull_y = _product(across, other, weight), _product(down, other, weight)
@@ -160,8 +161,8 @@ def find_patches(
                 break
         if (x - starts[i, 0]) ** 2 + (y - starts[i, 1]) ** 2 < _FARTHEST**2:
             places[i, 0], places[i, 1] = x, y
-            similarity[i] = alike
-            # What is left of a patch has 2 (1 - alike) of its power, both being scaled to the same.
-            noise = 2 * max(1 - alike, np.float32(0)) * contrast * contrast / (independent * determinant)
-            spread[i, 0, 0], spread[i, 1, 1] = noise * yy, noise * xx
-            spread[i, 0, 1] = spread[i, 1, 0] = -noise * xy
+            similarity[i] = correlation
+            # What is left of a patch has 2 (1 - correlation) of its power, both being scaled to the same.
+            noise = 2 * max(1 - correlation, np.float32(0)) * contrast * contrast / (independent * determinant)
+            covariance[i, 0, 0], covariance[i, 1, 1] = noise * yy, noise * xx
+            covariance[i, 0, 1] = covariance[i, 1, 0] = -noise * xy

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from fieldpose.stages.kernel_cache import cached_njit
+
 _AROUND = np.array([[0.0, 0.0], [-0.5, 0.0], [0.5, 0.0], [0.0, -0.5], [0.0, 0.5]])
 """From a pixel to itself, and to half a pixel left, right, above and below."""
 _FLATTEST, _STEEPEST = 0.15, 6.0
@@ -21,7 +23,7 @@ def _distorted(x: float, y: float, distortion: np.ndarray) -> tuple[float, float
     return x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def warp_patches(
     pixels: np.ndarray, inverse_depth: np.ndarray, slopes: np.ndarray, view: np.ndarray, frame_from_view: np.ndarray,
     frame: np.ndarray, distortion: np.ndarray, size: tuple[int, int], places: np.ndarray, view_from_frame: np.ndarray,

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
-from fieldpose.stages.geometry import Camera
+from fieldpose.stages.geometry import Camera, scale_pixels
+from fieldpose.stages.images import shrunk_with_camera
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 from fieldpose.stages.refinement.config import RefinementConfig
 from fieldpose.stages.refinement.optimisers import adam, levenberg_marquardt
@@ -80,13 +80,11 @@ def refine(
 def _shrunk(
     image: np.ndarray, camera: Camera, keypoints: np.ndarray, size: int
 ) -> tuple[np.ndarray, Camera, np.ndarray]:
-    factor = size / max(camera.width, camera.height)
-    if factor >= 1:
+    small_image, small = shrunk_with_camera(image, camera, size)
+    if small is camera:
         return image, camera, keypoints
-    small = camera.scaled(factor)
-    image = cv2.resize(image, (small.width, small.height), interpolation=cv2.INTER_AREA)
     scale = np.array([small.width / camera.width, small.height / camera.height])
-    return image, small, (keypoints + 0.5) * scale - 0.5
+    return small_image, small, scale_pixels(keypoints, scale)
 
 
 def _candidates(keypoints: np.ndarray, camera: Camera, config: RefinementConfig) -> np.ndarray:

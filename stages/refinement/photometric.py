@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from fieldpose.stages.geometry import Camera, twist_covariance
+from fieldpose.stages.geometry import Camera, image_jacobian, twist_covariance, twist_gradient
 from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedRays
 from fieldpose.stages.refinement.config import RefinementConfig
 
@@ -141,12 +141,11 @@ def _rays(sample: PixelSample, cam_from_object: np.ndarray) -> tuple[np.ndarray,
 def _through_rays(by_ray: np.ndarray, directions: np.ndarray, cam_from_object: np.ndarray) -> np.ndarray:
     """From derivatives (n, k, 6) by origin and direction in the object to those by the left twist.
 
-    A twist (rho, phi) moves the origin by -R^T rho and turns the direction d in the camera to d + d x phi.
+    In the camera's axes all rays start at 0, and the object moving by a twist is the rays moving by its negative.
     """
     object_to_cam = cam_from_object[:3, :3].T.astype(np.float32)
-    by_shift = -by_ray[..., :3] @ object_to_cam
-    by_turn = np.cross(by_ray[..., 3:] @ object_to_cam, directions[:, None])
-    return np.concatenate([by_shift, by_turn], axis=-1)
+    in_cam = np.concatenate([by_ray[..., :3] @ object_to_cam, by_ray[..., 3:] @ object_to_cam], axis=-1)
+    return -twist_gradient(np.zeros(3, np.float32), directions[:, None], in_cam)
 
 
 def _along_motion(sample: PixelSample, depth: np.ndarray) -> np.ndarray:
@@ -157,8 +156,5 @@ def _along_motion(sample: PixelSample, depth: np.ndarray) -> np.ndarray:
     """
     u, v = sample.directions[:, 0], sample.directions[:, 1]
     inverse = np.where(depth > 0, 1 / np.maximum(depth, 1e-6), 0)
-    zero = np.zeros_like(u)
-    move_u = np.stack([inverse, zero, -u * inverse, -u * v, 1 + u * u, -v], axis=1)
-    move_v = np.stack([zero, inverse, -v * inverse, -1 - v * v, u * v, u], axis=1)
-    motion = np.stack([move_u, move_v], axis=1) * (depth > 0)[:, None, None]
+    motion = image_jacobian(u, v, inverse) * (depth > 0)[:, None, None]
     return -sample.slopes @ motion

@@ -77,7 +77,7 @@ class ViewSource:
 
 def view_camera(camera: Camera, size: int) -> Camera:
     """The camera without distortion, its longer side at most `size` pixels."""
-    return camera.undistorted().scaled(min(1.0, size / max(camera.width, camera.height)))
+    return camera.undistorted().shrunk(size)
 
 
 @dataclass(frozen=True)

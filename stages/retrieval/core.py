@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fieldpose.stages.matching.core import MatchingConfig, shrink
+from fieldpose.stages.images import shrunk
+from fieldpose.stages.matching.core import MatchingConfig
 from fieldpose.stages.nerf.field import DESCRIPTOR_SIZE
 from fieldpose.stages.retrieval.config import RetrievalConfig
 
@@ -80,7 +81,7 @@ def describer(matching: MatchingConfig, longer_side: int, keypoints: int = _REME
     )
 
     def describe(image: np.ndarray) -> np.ndarray:
-        features = extractor.extract(shrink(image, longer_side)[0])
+        features = extractor.extract(shrunk(image, longer_side))
         descriptors: np.ndarray = features.data.cpu().numpy()
         return descriptors
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from fieldpose.bus.messages import CameraOrigin, TrackingState
-from fieldpose.stages.tracking.distance import Limit
+from fieldpose.stages.geometry import Limit
 from fieldpose.stages.tracking.policy import Belief, FrameInfo
 
 _ELSEWHERE_DEG, _ELSEWHERE = 10.0, 0.2
@@ -50,6 +50,6 @@ class Certainty:
         """The covariance (6, 6) of a pose (4, 4) that was found from a view rendered at `guess`."""
         if covariance is None:
             return None
-        apart = min(self._elsewhere.of(guess, pose), 1.0)
+        apart = min(self._elsewhere.distance_ratio(guess, pose), 1.0)
         scaled: np.ndarray = covariance * (self._factor * (1 - apart) + apart)
         return scaled

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fieldpose.bus.messages import GuessReason, Reason, TrackingState
+from fieldpose.stages.geometry import Limit
 from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.tracking.certainty import Certainty
 from fieldpose.stages.tracking.config import TrackingConfig
-from fieldpose.stages.tracking.distance import Limit
 from fieldpose.stages.tracking.policy import Alike, Attempt, Belief, FrameInfo, Look, PoseGuess, PoseResult, Step
 from fieldpose.stages.tracking.priors import Priors
 from fieldpose.stages.tracking.scoring import believed, score

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from fieldpose.stages.geometry import Limit
 from fieldpose.stages.tracking.config import ScoreConfig, TrackingConfig
-from fieldpose.stages.tracking.distance import Limit
 from fieldpose.stages.tracking.policy import PoseResult
 
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from fieldpose.errors import ConfigError
+from fieldpose.stages.geometry import Limit, pairwise
 from fieldpose.stages.nerf.training_views import TrainingViews
-from fieldpose.stages.tracking.distance import Limit, pairwise
 
 
 def farthest_point_order(poses: np.ndarray, limit: Limit) -> list[int]:

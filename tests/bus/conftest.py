@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 
 Spawn = Callable[..., "subprocess.Popen[str]"]
 
-HUB = "import sys; from bus.transport import serve_hub; serve_hub(sys.argv[1])"
+HUB = "import sys; from fieldpose.bus.transport import serve_hub; serve_hub(sys.argv[1])"
 
 
 class Processes:

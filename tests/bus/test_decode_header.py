@@ -9,8 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldpose.bus.codec import decode_header, encode
-from fieldpose.bus.messages import Camera, Frame, Header, Truth
+from fieldpose.bus.messages import Frame, Header, Truth
 from fieldpose.errors import CodecError
+from fieldpose.stages.geometry import Camera
 
 HEADER = Header("camera", 3, 17, 0, 123, 456)
 

@@ -124,7 +124,7 @@ class TestFile:
         assert schema is not None
         assert (schema.name, schema.encoding) == ("Frame", "jsonschema")
         properties = json.loads(schema.data)["$defs"]["Frame"]["properties"]
-        assert set(properties) == {"header", "image", "encoding", "camera"}
+        assert set(properties) == {"header", "image", "encoding", "camera", "camera_origin"}
 
     def test_chunks_are_uncompressed_and_of_a_few_megabytes(self, path: Path) -> None:
         writer = RecordingWriter(path)

@@ -212,7 +212,7 @@ def pools_of_this_process() -> set[str]:
     return {path for path in mapped if Path(path).exists() and Path(path).stat().st_size >= 64 << 20}
 
 
-HUB = "import sys; from bus.transport import serve_hub; serve_hub(sys.argv[1])"
+HUB = "import sys; from fieldpose.bus.transport import serve_hub; serve_hub(sys.argv[1])"
 
 
 class TestProcesses:

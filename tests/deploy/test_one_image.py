@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from fieldpose.stages.nerf.training_views import TrainingViews, training_views
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 from support.pictures import needs
 
@@ -25,6 +24,7 @@ from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.nerf.field import load_field
 from fieldpose.stages.nerf.loading import make_renderer
 from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedRays, RenderedView
+from fieldpose.stages.nerf.training_views import TrainingViews, training_views
 
 NO_VIEWS = TrainingViews((), np.zeros((0, 4, 4)))
 SETTINGS = changed(Settings(), {"matching": {"matcher": "sift"}, "refinement": {"steps": 0}}, "test")

@@ -8,9 +8,11 @@ import numpy as np
 
 from fieldpose.bus import topics
 from fieldpose.bus.messages import (
-    Camera,
+    CameraInfo,
+    CameraOrigin,
     Correspondences,
     Estimate,
+    Failure,
     Frame,
     Guess,
     GuessReason,
@@ -18,8 +20,10 @@ from fieldpose.bus.messages import (
     Matches,
     Message,
     Pose,
+    Prior,
     Reason,
     Retrieved,
+    Search,
     State,
     Stats,
     TrackingState,
@@ -28,6 +32,7 @@ from fieldpose.bus.messages import (
 )
 from fieldpose.bus.ports import first_header
 from fieldpose.bus.topics import Address, Topic
+from fieldpose.stages.geometry import Camera
 
 ADDRESS = Address("test", "mug", "cam")
 CAMERA = Camera(6, 4, 5.0, 5.0, 2.5, 1.5, (0.1, 0.0, 0.0, 0.0, -0.2))
@@ -47,8 +52,17 @@ def frame(frame_id: int = 0, width: int = 6, height: int = 4, header: Header | N
     return Frame(header=header or first_header(frame_id, 1000 + frame_id), image=image, encoding="rgb8", camera=camera)
 
 
+def camera_info(frame_id: int = 0) -> CameraInfo:
+    header = first_header(frame_id, 1000 + frame_id)
+    return CameraInfo(header=header, camera=CAMERA, camera_origin=CameraOrigin.ASSUMED)
+
+
 def truth(frame_id: int = 0) -> Truth:
     return Truth(header=first_header(frame_id, 1000 + frame_id), cam_from_object=np.eye(4))
+
+
+def prior(frame_id: int = 0) -> Prior:
+    return Prior(header=first_header(frame_id, 1000 + frame_id), cam_from_object=np.eye(4))
 
 
 def guess(frame_id: int = 0, pass_index: int = 0) -> Guess:
@@ -56,11 +70,9 @@ def guess(frame_id: int = 0, pass_index: int = 0) -> Guess:
     return Guess(header=header, reason=GuessReason.PRIOR, cam_from_object=np.eye(4), camera=CAMERA)
 
 
-def view(frame_id: int = 0, pass_index: int = 0, ok: bool = True, reason: Reason = Reason.OK) -> View:
+def view(frame_id: int = 0, pass_index: int = 0) -> View:
     return View(
         header=first_header(frame_id, 1000 + frame_id, pass_index),
-        ok=ok,
-        reason=reason,
         view_id="v1",
         cam_from_object=np.eye(4),
         camera=CAMERA,
@@ -70,11 +82,9 @@ def view(frame_id: int = 0, pass_index: int = 0, ok: bool = True, reason: Reason
     )
 
 
-def matches(header: Header, count: int = 5, ok: bool = True, reason: Reason = Reason.OK) -> Matches:
+def matches(header: Header, count: int = 5) -> Matches:
     return Matches(
         header=header,
-        ok=ok,
-        reason=reason,
         view_id="v1",
         pixels_in_view=pixels(count),
         pixels_in_frame=pixels(count),
@@ -82,22 +92,29 @@ def matches(header: Header, count: int = 5, ok: bool = True, reason: Reason = Re
     )
 
 
-def every_message() -> dict[Topic, Message]:
+def failure(frame_id: int = 0, stage: str = "matching", reason: Reason = Reason.TOO_FEW_MATCHES) -> Failure:
+    return Failure(header=first_header(frame_id, 1000 + frame_id), stage=stage, reason=reason)
+
+
+def every_message() -> dict[Topic[Any], Message]:
     """One message for each topic of the table."""
     header = first_header(3, 1003, 1)
-    result: dict[str, Any] = {"header": header, "ok": True, "reason": Reason.OK}
     pose: dict[str, Any] = {"cam_from_object": np.eye(4), "covariance": np.eye(6)}
     return {
         topics.FRAME: frame(3),
+        topics.CAMERA_INFO: camera_info(3),
         topics.TRUTH: Truth(header=header, cam_from_object=None),
+        topics.PRIOR: prior(3),
+        topics.SEARCH: Search(header=header),
+        topics.RETRIEVED: Retrieved(
+            header=header, cam_from_object=np.stack([np.eye(4)] * 5), similarity=scores(5)[::-1].copy()
+        ),
         topics.GUESS: guess(3),
-        topics.RETRIEVED: Retrieved(**result, cam_from_object=np.stack([np.eye(4)] * 5), similarity=scores(5)),
         topics.VIEW: view(3),
         topics.MATCHES: matches(header),
         topics.CORRESPONDENCES: Correspondences(
-            **result,
-            camera=CAMERA,
-            guess_cam_from_object=np.eye(4),
+            header=header,
+            view_cam_from_object=np.eye(4),
             pixels_in_frame=pixels(5),
             points_in_object=pixels(5, 3),
             confidence=scores(5),
@@ -105,10 +122,10 @@ def every_message() -> dict[Topic, Message]:
             kept=np.array([True, False, True, True, False]),
         ),
         topics.ESTIMATE: Estimate(
-            **result, **pose, camera=CAMERA, inliers_in_frame=pixels(3), correspondences=5, residual_px=0.5
+            header=header, **pose, inliers_in_frame=pixels(3), correspondences=5, residual_px=0.5
         ),
         topics.POSE: Pose(
-            **result,
+            header=header,
             **pose,
             inliers=3,
             correspondences=5,
@@ -117,11 +134,14 @@ def every_message() -> dict[Topic, Message]:
             loss_before=2.0,
             loss_after=1.0,
         ),
+        topics.FAILURE: failure(3),
         topics.STATE: State(
             header=header,
-            state=TrackingState.TRACKING,
-            score=0.9,
+            state=TrackingState.LIMITED,
+            score=0.0,
             **pose,
+            reason=Reason.TOO_FEW_MATCHES,
+            camera_origin=CameraOrigin.ASSUMED,
             in_flight=1,
             admitted=9,
             finished=8,

@@ -11,10 +11,18 @@ from functools import partial
 import numpy as np
 
 from fieldpose.bus.messages import CameraOrigin, GuessReason, Reason, TrackingState
-from fieldpose.stages.geometry import Camera, exp_se3, look_at, perturb, rotation_error_deg, translation_error
+from fieldpose.stages.geometry import (
+    Camera,
+    Limit,
+    exp_se3,
+    look_at,
+    pairwise,
+    perturb,
+    rotation_error_deg,
+    translation_error,
+)
 from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.tracking.core import GuessOrder, LookOrder, Output, StateReport, Tracker
-from fieldpose.stages.tracking.distance import Limit, pairwise
 from fieldpose.stages.tracking.policy import Alike, FrameInfo, PoseResult
 
 MS = 1_000_000
@@ -99,7 +107,7 @@ class World:
     def _solve(self, order: GuessOrder, rng: np.random.Generator) -> PoseResult:
         truth, guess = self.path(order.frame.capture_ns * 1e-9), order.guess.cam_from_object
         ids = order.frame.frame_id, order.pass_index
-        off = np.inf if truth is None else Limit(35.0, 2.5).of(truth, guess)
+        off = np.inf if truth is None else Limit(35.0, 2.5).distance_ratio(truth, guess)
         if off < 1.0 and truth is not None:
             error = 0.005 * rng.standard_normal(6) * (0.3 + off)
             covariance = np.diag([1e-4] * 3 + [1e-5] * 3)

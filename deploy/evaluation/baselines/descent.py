@@ -1,4 +1,4 @@
-"""What descending a colour difference takes: derivatives of rays by the motion of their camera, and Adam.
+"""What descending a colour difference takes: rays with their derivatives, and Adam.
 
 A motion (shift 3, turn 3) is a twist of the object's frame that moves the camera: exp_se3(motion) @ object_from_cam.
 """
@@ -13,16 +13,6 @@ from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedRays
 RGB = np.eye(3, dtype=np.float32)
 _BETA1, _EPSILON = 0.9, 1e-8
 _SERIES = 24
-
-
-def by_motion(origins: np.ndarray, directions: np.ndarray, by_ray: np.ndarray) -> np.ndarray:
-    """From derivatives (..., 6) by a ray's origin and direction (..., 3) to those by the motion of its camera.
-
-    A motion (rho, phi) moves an origin o to o + rho + phi x o and turns a direction d to d + phi x d.
-    """
-    by_origin, by_direction = by_ray[..., :3], by_ray[..., 3:]
-    by_turn = np.cross(origins, by_origin) + np.cross(directions, by_direction)
-    return np.concatenate([by_origin, by_turn], axis=-1)
 
 
 def rendered_with(

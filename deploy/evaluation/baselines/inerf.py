@@ -16,8 +16,8 @@ from typing import Any, ClassVar
 import cv2
 import numpy as np
 
-from fieldpose.deploy.evaluation.baselines.descent import Adam, by_motion, left_jacobian, rendered_with
-from fieldpose.stages.geometry import Camera, exp_se3, inverse
+from fieldpose.deploy.evaluation.baselines.descent import Adam, left_jacobian, rendered_with
+from fieldpose.stages.geometry import Camera, exp_se3, inverse, twist_gradient
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 from fieldpose.stages.refinement.photometric import keypoint_region
 
@@ -82,5 +82,5 @@ def squared_error(
     rendered, jacobian = rendered_with(renderer, origins, turned)
     residuals = (rendered.rgb - colours).astype(np.float64)
     by_ray = np.einsum("nk,nkj->nj", residuals, jacobian) * (2 / residuals.size)
-    gradient = by_motion(origins, turned, by_ray).sum(axis=0)
+    gradient = twist_gradient(origins, turned, by_ray).sum(axis=0)
     return float((residuals**2).mean()), left_jacobian(twist).T @ gradient

@@ -21,8 +21,8 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fieldpose.deploy.evaluation.baselines.descent import Adam, by_motion, rendered_with
-from fieldpose.stages.geometry import Camera, inverse, perturb
+from fieldpose.deploy.evaluation.baselines.descent import Adam, rendered_with
+from fieldpose.stages.geometry import Camera, inverse, perturb, twist_gradient
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 
 _BETA2 = 0.99
@@ -166,7 +166,7 @@ def errors(
     values, slopes = loss(residuals, sample.colours, config.loss)
     by_ray = np.einsum("mnk,mnkj->mnj", slopes, jacobian.reshape(*residuals.shape, 6))
     pivot = hypotheses.centres[:, None] if config.turn_about == "camera" else 0.0
-    gradient = by_motion(origins - pivot, directions, by_ray).mean(axis=1) / 3
+    gradient = twist_gradient(origins - pivot, directions, by_ray).mean(axis=1) / 3
     return values.mean(axis=(1, 2)), gradient
 
 

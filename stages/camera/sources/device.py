@@ -9,10 +9,11 @@ from contextlib import contextmanager
 import cv2
 
 from fieldpose.errors import SourceError
-from fieldpose.stages.camera.calibration import Calibration, Calibrator, shrunk
+from fieldpose.stages.camera.calibration import Calibration, Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.camera.sources.capture import opened
+from fieldpose.stages.images import shrunk_with_camera
 
 
 def open_device(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
@@ -37,7 +38,7 @@ def _frames(device: str, frame_id: int, calibration: Calibration, size: int | No
             read, bgr = capture.retrieve()
             if not read or bgr.shape[:2] != (camera.height, camera.width):
                 raise SourceError(f"camera:{device}: gave a frame that cannot be read, or of another size")
-            image, resized = shrunk(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
+            image, resized = shrunk_with_camera(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
             yield CapturedFrame(frame_id, image, "rgb8", resized, f"camera{device}#{frame_id}", at_ns, origin=origin)
             frame_id += 1
 

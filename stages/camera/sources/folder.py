@@ -10,9 +10,10 @@ import numpy as np
 from PIL import Image
 
 from fieldpose.errors import DatasetError, SourceError
-from fieldpose.stages.camera.calibration import Calibrator, shrunk
+from fieldpose.stages.camera.calibration import Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
+from fieldpose.stages.images import shrunk_with_camera
 from fieldpose.stages.nerf.datasets.images import EXTENSIONS, load_pixels, over_background, probe
 
 _ORIENTATION = 0x0112
@@ -52,7 +53,7 @@ def _read(frame_id: int, path: Path, config: CameraConfig, calibrator: Calibrato
         pixels = over_background(load_pixels(path, width, height, probe(path).has_alpha), "white")
     except DatasetError as error:
         raise SourceError(str(error)) from error
-    image, camera = shrunk(pixels, camera, config.size)
+    image, camera = shrunk_with_camera(pixels, camera, config.size)
     return CapturedFrame(frame_id, image, "rgb8", camera, path.name, origin=origin)
 
 

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Iterator
 from itertools import islice
 from typing import cast
 
-import cv2
 import numpy as np
+from cachetools import FIFOCache
 
 from fieldpose.bus.messages import Frame, Truth
 from fieldpose.bus.replay import Recorded, read_recording
 from fieldpose.bus.topics import FRAME, TRUTH
 from fieldpose.errors import RecordingError, SourceError
-from fieldpose.stages.camera.calibration import Calibrator, shrunk
+from fieldpose.stages.camera.calibration import Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source, TruePose
+from fieldpose.stages.images import shrunk_with_camera
+from fieldpose.stages.wire import frame_image
 
 _TRUTH_MAY_LAG = 4
 _TRUTHS_KEPT = 64
@@ -39,7 +41,7 @@ def _frames(path: str, size: int | None) -> Iterator[CapturedFrame]:
         known = None if truth is None else TruePose(truth.cam_from_object)
         image, encoding = frame.image, frame.encoding
         if size is not None and max(camera.width, camera.height) > size:
-            image, camera = shrunk(_decoded(frame, path), camera, size)
+            image, camera = shrunk_with_camera(_decoded(frame, path), camera, size)
             encoding = "rgb8"
         name = f"frame {header.frame_id}"
         yield CapturedFrame(
@@ -50,12 +52,10 @@ def _frames(path: str, size: int | None) -> Iterator[CapturedFrame]:
 def _with_truths(path: str) -> Iterator[tuple[Frame, Truth | None]]:
     """Each frame with its truth, which may stand a little before or after it in the file."""
     waiting: deque[Frame] = deque()
-    truths: OrderedDict[int, Truth] = OrderedDict()
+    truths: FIFOCache[int, Truth] = FIFOCache(_TRUTHS_KEPT)
     for recorded in _messages(path):
         if recorded.topic is TRUTH:
             truths[recorded.message.header.frame_id] = cast(Truth, recorded.message)
-            if len(truths) > _TRUTHS_KEPT:
-                truths.popitem(last=False)
         else:
             waiting.append(cast(Frame, recorded.message))
         while waiting and (waiting[0].header.frame_id in truths or len(waiting) > _TRUTH_MAY_LAG):
@@ -78,9 +78,7 @@ def _messages(path: str) -> Iterator[Recorded]:
 
 
 def _decoded(frame: Frame, path: str) -> np.ndarray:
-    if frame.encoding == "rgb8":
-        return frame.image
-    bgr = cv2.imdecode(frame.image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if bgr is None or bgr.shape[:2] != (frame.camera.height, frame.camera.width):
+    image = frame_image(frame)
+    if image is None:
         raise SourceError(f"{path}: the {frame.encoding} image of frame {frame.header.frame_id} cannot be read")
-    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+    return image

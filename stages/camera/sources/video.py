@@ -9,10 +9,11 @@ from pathlib import Path
 import cv2
 
 from fieldpose.errors import SourceError
-from fieldpose.stages.camera.calibration import Calibration, Calibrator, shrunk
+from fieldpose.stages.camera.calibration import Calibration, Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.camera.sources.capture import opened
+from fieldpose.stages.images import shrunk_with_camera
 
 _FALLBACK_FPS = 30.0
 
@@ -45,7 +46,7 @@ def _frames(path: Path, first: int, calibration: Calibration, fps: float, size: 
                 read, bgr = capture.retrieve()
                 if not read or bgr.shape[:2] != (camera.height, camera.width):
                     raise SourceError(f"{path}: frame {index} cannot be read, or is not of the first one's size")
-                image, resized = shrunk(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
+                image, resized = shrunk_with_camera(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
                 name, at_ns = f"{path.name}#{index}", round(at_ms * 1e6)
                 yield CapturedFrame(index, image, "rgb8", resized, name, at_ns, origin=origin)
             index += 1

@@ -109,7 +109,7 @@ class Dataset:
 
     def resized(self, size: int) -> Dataset:
         """The same dataset with every image's longer side shrunk to `size` pixels; none is enlarged."""
-        return replace(self, images=tuple(_resized_record(record, size) for record in self.images))
+        return replace(self, images=tuple(replace(record, camera=record.camera.shrunk(size)) for record in self.images))
 
     def content_hash(self) -> str:
         """sha256 (hex) over names, cameras, poses and the bytes of the image files."""
@@ -144,9 +144,3 @@ def _tail(name: str, count: int) -> tuple[str, ...]:
 
 def _stem(name: str) -> str:
     return str(PurePosixPath(name).with_suffix(""))
-
-
-def _resized_record(record: ImageRecord, size: int) -> ImageRecord:
-    camera = record.camera
-    factor = min(1.0, size / max(camera.width, camera.height))
-    return replace(record, camera=camera.scaled(factor))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from fieldpose.stages.kernel_cache import cached_njit
+
 CHUNK = 64
 ADAM_MATH = {"contract", "nsz", "arcp"}
 
@@ -46,7 +48,7 @@ def update(
         parameter[k] -= np.float32(0) if stays else rate * m / (np.sqrt(v) + epsilon)
 
 
-@njit(nogil=True, cache=True, fastmath=ADAM_MATH)
+@cached_njit(nogil=True, fastmath=ADAM_MATH)
 def adam_step(
     parameter: np.ndarray,
     gradients: tuple[np.ndarray, ...],

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.kernel_cache import cached_njit
 from fieldpose.stages.nerf.kernels.packet import density, density_network
 from fieldpose.stages.nerf.kernels.types import Net, Samples
 
 
-@njit(nogil=True, fastmath=FASTMATH, cache=True)
+@cached_njit(nogil=True, fastmath=FASTMATH)
 def densities(net: Net, u: np.ndarray, first: int, last: int, samples: Samples, out: np.ndarray) -> None:
     """Fill out[first:last] with the density at u (n, 3) in the unit cube."""
     size = min(samples.t.shape[0], 256)
@@ -22,7 +22,7 @@ def densities(net: Net, u: np.ndarray, first: int, last: int, samples: Samples, 
             out[start + s] = density(samples.out[s, 0])
 
 
-@njit(nogil=True, cache=True)
+@cached_njit(nogil=True)
 def raise_to(estimate: np.ndarray, cells: np.ndarray, values: np.ndarray) -> None:
     """estimate[cells] = max(estimate[cells], values), also where a cell comes twice."""
     for i in range(cells.shape[0]):

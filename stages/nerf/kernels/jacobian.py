@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.kernel_cache import cached_njit
 from fieldpose.stages.nerf.kernels.backward import (
     colour_backward,
     compact,
@@ -71,7 +72,7 @@ def ray_gradients(
             jacobian[r, k, 3 + a] += dy[a] * samples.t[s]
 
 
-@njit(nogil=True, fastmath=FASTMATH, cache=True)
+@cached_njit(nogil=True, fastmath=FASTMATH)
 def render_jacobian(
     net: Net,
     dom: Domain,

@@ -6,13 +6,14 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.kernel_cache import cached_njit
 from fieldpose.stages.nerf.kernels.march import begin
 from fieldpose.stages.nerf.kernels.packet import forward, shade, surface, trace
 from fieldpose.stages.nerf.kernels.sight import narrow
 from fieldpose.stages.nerf.kernels.types import Domain, Net, Rays, Samples, Tiles
 
 
-@njit(nogil=True, fastmath=FASTMATH, cache=True)
+@cached_njit(nogil=True, fastmath=FASTMATH)
 def render(
     net: Net,
     dom: Domain,
@@ -53,7 +54,7 @@ def level_of(colour: float) -> int:
     return np.uint8(min(max(colour, np.float32(0)), np.float32(1)) * np.float32(255) + np.float32(0.5))
 
 
-@njit(nogil=True, fastmath=FASTMATH, cache=True)
+@cached_njit(nogil=True, fastmath=FASTMATH)
 def render_tiles(
     net: Net,
     dom: Domain,

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.kernel_cache import cached_njit
 from fieldpose.stages.nerf.kernels.space import BLOCK
 from fieldpose.stages.nerf.kernels.types import Domain, Rays
 
@@ -45,7 +46,7 @@ def tile_of(pixel: float, tile: int, tiles: int) -> int:
     return np.int64(min(max(pixel / tile, 0.0), np.float64(tiles - 1)))
 
 
-@njit(nogil=True, fastmath=FASTMATH, cache=True)
+@cached_njit(nogil=True, fastmath=FASTMATH)
 def tile_limits(
     centres: np.ndarray, radius: float, turn: np.ndarray, origin: np.ndarray, intrinsics: np.ndarray, tile: int,
     limits: np.ndarray,

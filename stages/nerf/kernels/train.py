@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.kernel_cache import cached_njit
 from fieldpose.stages.nerf.kernels.backward import (
     colour_backward,
     compact,
@@ -43,7 +44,7 @@ def accumulate(net: Net, samples: Samples, rays: Rays, rows: int, count: int, gr
         scatter(net, samples, 0, rows, grads.table)
 
 
-@njit(nogil=True, fastmath=FASTMATH, cache=True)
+@cached_njit(nogil=True, fastmath=FASTMATH)
 def train(
     net: Net,
     dom: Domain,

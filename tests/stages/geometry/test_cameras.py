@@ -5,7 +5,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldpose.errors import GeometryError
-from fieldpose.stages.geometry import Camera, exp_se3, look_at, points_at_depth, rays
+from fieldpose.stages.geometry import (
+    Camera,
+    exp_se3,
+    look_at,
+    points_at_depth,
+    rays,
+    scale_pixels,
+    shrunk_size,
+    unscale_pixels,
+)  # fmt: skip
 from fieldpose.stages.geometry.cameras import distort
 
 # The phone camera of instant-ngp's fox, and one with every coefficient at work.
@@ -34,7 +43,7 @@ def corners(camera: Camera) -> np.ndarray:
 
 @pytest.mark.parametrize("camera", [PHONE, BARREL, PHONE.undistorted()])
 def test_directions_and_project_are_inverse_at_every_pixel(camera: Camera) -> None:
-    camera = camera.scaled(0.25)
+    camera = camera.shrunk(max(camera.width, camera.height) // 4)
     directions = camera.directions(camera.grid())
     assert directions.dtype == np.float32
     assert np.all(directions[:, 2] == 1)
@@ -130,10 +139,32 @@ def test_resizing_agrees_with_area_averaging() -> None:
     camera = Camera(80, 60, 100.0, 100.0, float((image * x).sum() / 16), float((image * y).sum() / 16))
     small = cv2.resize(image, (20, 15), interpolation=cv2.INTER_AREA)
     x, y = np.meshgrid(np.arange(20), np.arange(15))
-    quarter = camera.scaled(0.25)
+    quarter = camera.shrunk(20)
     assert (quarter.cx, quarter.cy) == pytest.approx(
         ((small * x).sum() / small.sum(), (small * y).sum() / small.sum())
     )
+
+
+@given(st.integers(1, 5000), st.integers(1, 5000), st.integers(1, 5000))
+def test_a_shrunk_size_is_no_larger_than_asked_for_and_of_the_same_shape(width: int, height: int, most: int) -> None:
+    small = shrunk_size(width, height, most)
+    assert max(small) == min(most, max(width, height))
+    factor = max(small) / max(width, height)
+    assert small == pytest.approx(np.maximum((width * factor, height * factor), 1), abs=0.5)
+
+
+def test_a_camera_is_shrunk_but_never_enlarged() -> None:
+    assert BARREL.shrunk(max(BARREL.width, BARREL.height)) is BARREL
+    assert BARREL.shrunk(10_000) is BARREL
+    assert BARREL.shrunk(100) == BARREL.resized(*shrunk_size(BARREL.width, BARREL.height, 100))
+
+
+def test_pixels_are_scaled_about_the_corner_of_the_image() -> None:
+    scale = np.array([0.5, 0.25])
+    borders = np.array([[-0.5, -0.5], [79.5, 59.5], [10.0, 3.0]])
+    scaled = scale_pixels(borders, scale)
+    np.testing.assert_array_equal(scaled, [[-0.5, -0.5], [39.5, 14.5], [4.75, 0.375]])
+    np.testing.assert_array_equal(unscale_pixels(scaled, scale), borders)
 
 
 def test_grid_runs_along_the_rows() -> None:
@@ -155,7 +186,7 @@ def test_rays_pass_through_the_projected_point_at_its_depth(camera: Camera, dept
 
 
 def test_rays_of_all_pixels_follow_the_grid() -> None:
-    camera = BARREL.scaled(0.05)
+    camera = BARREL.shrunk(32)
     _, everywhere = rays(camera, np.eye(4))
     np.testing.assert_array_equal(everywhere, camera.directions(camera.grid()))
 

@@ -12,7 +12,6 @@ from fieldpose.stages.matching.core import (
     MatchingConfig,
     PairMatcher,
     build_matcher,
-    shrink,
     visible_mask,
 )
 from fieldpose.stages.matching.subpixel import align_patches
@@ -101,6 +100,15 @@ def test_kept_features_are_bounded() -> None:
     assert len(matcher.extracted) == 102
 
 
+def test_no_view_is_kept_where_there_is_room_for_none() -> None:
+    matcher = Corners()
+    pairs = PairMatcher(matcher, MatchingConfig(kept_views=0))
+    image, solid = picture(0, 64), np.ones((64, 64), np.float32)
+    for _ in range(2):
+        pairs.match(image, solid, image, "view", "frame")
+    assert len(matcher.extracted) == 3
+
+
 def test_a_large_frame_is_matched_at_the_views_size_and_answered_in_its_own_pixels() -> None:
     matcher = Corners()
     frame = np.zeros((480, 640, 3), np.uint8)
@@ -124,13 +132,6 @@ def test_the_background_of_the_view_is_masked_inside_the_silhouette() -> None:
     assert not eroded[15, 25]
     np.testing.assert_array_equal(visible_mask(np.rint(opacity * 255).astype(np.uint8), 2), eroded)
     assert visible_mask(np.ones((5, 5), np.float32), 2).all()
-
-
-def test_shrinking_keeps_small_images_as_they_are() -> None:
-    image = picture(0, 64)
-    same, scale = shrink(image, 64)
-    assert same is image
-    np.testing.assert_array_equal(scale, (1, 1))
 
 
 def test_patches_are_aligned_to_a_fraction_of_a_pixel() -> None:

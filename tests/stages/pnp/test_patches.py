@@ -17,10 +17,10 @@ def texture(rng: np.random.Generator, size: tuple[int, int] = (90, 110), blur: f
 def found(first: np.ndarray, second: np.ndarray, centres: np.ndarray, warps: np.ndarray, starts: np.ndarray,
           half: int = 4, steps: int = 8) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     places, similarity = np.empty((len(centres), 2), np.float32), np.empty(len(centres), np.float32)
-    spread = np.full((len(centres), 2, 2), np.nan, np.float32)
+    covariance = np.full((len(centres), 2, 2), np.nan, np.float32)
     given_as = [np.ascontiguousarray(array, np.float32) for array in (centres, warps, starts)]
-    find_patches(first, second, *given_as, half, steps, places, similarity, spread)
-    return places, similarity, spread
+    find_patches(first, second, *given_as, half, steps, places, similarity, covariance)
+    return places, similarity, covariance
 
 
 def bilinear(image: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -76,14 +76,14 @@ def test_the_kernel_does_what_its_plain_twin_does(seed: int, half: int, steps: i
     centres = rng.uniform(-3, 112, (12, 2)).astype(np.float32)
     starts = (centres + np.array([3, 5]) + rng.normal(0, 1, (12, 2))).astype(np.float32)
     warps = (np.eye(2) + rng.normal(0, 0.1, (12, 2, 2))).astype(np.float32)
-    places, similarity, spread = found(first, second, centres, warps, starts, half, steps)
+    places, similarity, covariance = found(first, second, centres, warps, starts, half, steps)
     for i in range(len(centres)):
         place, alike, doubt = plain(first, second, centres[i], warps[i], starts[i], half, steps)
         if abs(np.linalg.norm(place - starts[i]) - 3) > 0.1:  # on the limit either answer is right
             assert places[i] == pytest.approx(place, abs=0.02)
             assert similarity[i] == pytest.approx(alike, abs=0.01)
             if alike > 0.2:  # far below what counts as found; a plain place has no contrast that could be scaled
-                assert spread[i] == pytest.approx(doubt, rel=0.1, abs=0.01 * np.trace(doubt) + 1e-6)
+                assert covariance[i] == pytest.approx(doubt, rel=0.1, abs=0.01 * np.trace(doubt) + 1e-6)
 
 
 @settings(max_examples=25, deadline=None)
@@ -110,22 +110,23 @@ def test_nothing_is_found_where_nothing_is_to_be_seen() -> None:
     ramp = np.tile(np.linspace(0, 1, 60, dtype=np.float32), (60, 1))
     places = np.array([[30.0, 30.0]], np.float32)
     for first, second in ((even, varied), (ramp, ramp)):
-        at, similarity, spread = found(first, second, places, np.eye(2)[None], places)
-        assert not spread.any()
+        at, similarity, covariance = found(first, second, places, np.eye(2)[None], places)
+        assert not covariance.any()
         assert similarity[0] == -1
         assert np.array_equal(at, places)
     assert found(varied, even, places, np.eye(2)[None], places)[1][0] < 0.1
 
 
-def test_the_spread_is_that_of_places_found_in_noise() -> None:
+def test_the_covariance_is_that_of_places_found_in_noise() -> None:
     """Over many draws of noise on the second image alone; a quarter off at most, for what is sampled between pixels."""
     rng = np.random.default_rng(3)
     first = texture(rng, (60, 60), 2.0)
     centre = np.array([[30.0, 29.0]], np.float32)
     draws = [found(first, first + rng.normal(0, 0.01, first.shape).astype(np.float32), centre, np.eye(2)[None], centre)
              for _ in range(400)]  # fmt: skip
-    places, spreads = np.array([places[0] for places, _, _ in draws]), np.array([spread[0] for _, _, spread in draws])
-    assert np.diag(np.cov(places.T)) == pytest.approx(np.diag(spreads.mean(axis=0)), rel=0.25)
+    places = np.array([places[0] for places, _, _ in draws])
+    covariances = np.array([covariance[0] for _, _, covariance in draws])
+    assert np.diag(np.cov(places.T)) == pytest.approx(np.diag(covariances.mean(axis=0)), rel=0.25)
 
 
 def test_in_the_same_image_no_place_is_less_than_certain() -> None:
@@ -133,9 +134,9 @@ def test_in_the_same_image_no_place_is_less_than_certain() -> None:
     rng = np.random.default_rng(5)
     image = texture(rng, (60, 60))
     centres = rng.integers(10, 50, (200, 2)).astype(np.float32)
-    _, similarity, spread = found(image, image, centres, np.tile(np.eye(2), (200, 1, 1)), centres)
+    _, similarity, covariance = found(image, image, centres, np.tile(np.eye(2), (200, 1, 1)), centres)
     assert similarity.max() > 1 - 1e-6
-    assert np.linalg.eigvalsh(spread.astype(float)).min() > -1e-12
+    assert np.linalg.eigvalsh(covariance.astype(float)).min() > -1e-12
 
 
 def test_along_an_edge_a_place_is_uncertain() -> None:
@@ -145,6 +146,6 @@ def test_along_an_edge_a_place_is_uncertain() -> None:
     first = cv2.GaussianBlur(edge.astype(np.float32), (0, 0), 1)
     noisy = first + rng.normal(0, 0.003, first.shape).astype(np.float32)
     centre = np.array([[30.0, 30.0]], np.float32)
-    _, similarity, spread = found(first, noisy, centre, np.eye(2)[None], centre)
+    _, similarity, covariance = found(first, noisy, centre, np.eye(2)[None], centre)
     assert similarity[0] > 0.9
-    assert spread[0, 1, 1] > 10 * spread[0, 0, 0]
+    assert covariance[0, 1, 1] > 10 * covariance[0, 0, 0]

@@ -11,12 +11,12 @@ from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry import Camera, exp_se3, inverse, log_se3, look_at, rotation_error_deg, translation_error
 from fieldpose.stages.pnp.core import PnpConfig, PnpResult, solve
 from fieldpose.stages.pnp.least_squares import (
+    exp_se3_times,
     fit_pose,
     huber_cost,
-    huber_width,
+    huber_delta,
     normal_equations,
     reprojection,
-    turned,
     weighted_lengths,
 )
 
@@ -244,7 +244,7 @@ def test_the_normal_equations_are_those_of_the_plain_residuals(seed: int, delta:
 def test_the_compiled_turn_is_the_exponential(shift: list[float], axis: list[float], angle: float) -> None:
     direction = np.array(axis) / max(float(np.linalg.norm(axis)), 1e-6)
     step, out = np.concatenate([shift, angle * direction]), np.empty((4, 4))
-    turned(step, POSE, out)
+    exp_se3_times(step, POSE, out)
     np.testing.assert_allclose(out, exp_se3(step) @ POSE, atol=1e-9)
 
 
@@ -256,7 +256,7 @@ def test_the_pose_that_is_fitted_is_a_minimum(seed: int) -> None:
     pixels = CAMERA.project(points @ POSE[:3, :3].T + POSE[:3, 3]) + rng.normal(0, 1.5, (60, 2))
     weights = random_weights(rng, 60)
     fit = fit_pose(pixels, points, CAMERA, exp_se3(rng.normal(0, 0.02, 6)) @ POSE, weights, 1e-9)
-    delta = huber_width(by_weights(fit.errors[0], weights))
+    delta = huber_delta(by_weights(fit.errors[0], weights))
 
     def loss(step: np.ndarray) -> float:
         residuals, _ = reprojection(pixels, points, CAMERA, exp_se3(step) @ fit.cam_from_object)

@@ -132,7 +132,7 @@ def test_distortion_is_removed_from_the_frames_rays(scene: AnalyticScene) -> Non
 
 
 def test_a_large_frame_is_shrunk_with_its_camera_and_keypoints(scene: AnalyticScene, keypoints: np.ndarray) -> None:
-    large = CAMERA.scaled(2)
+    large = CAMERA.resized(2 * CAMERA.width, 2 * CAMERA.height)
     image, at_large = frame_of(scene, large), (keypoints + 0.5) * 2 - 0.5
     config = RefinementConfig(samples=300, held_out=150, size=160)
     assert error(refine(scene, image, large, guess(6), at_large, np.random.default_rng(0), config)) < 0.05

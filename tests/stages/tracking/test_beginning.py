@@ -17,9 +17,8 @@ from support.tracking_world import on_sphere, ring_of_views
 
 from fieldpose.bus.messages import GuessReason, TrackingState
 from fieldpose.errors import ConfigError, DatasetError
-from fieldpose.stages.geometry import rotation_error_deg, translation_error
+from fieldpose.stages.geometry import Limit, pairwise, rotation_error_deg, translation_error
 from fieldpose.stages.tracking.config import TrackingConfig
-from fieldpose.stages.tracking.distance import Limit, pairwise
 from fieldpose.stages.tracking.policy import Attempt, FrameInfo, PoseResult
 
 VIEWS = ring_of_views()
@@ -329,7 +328,7 @@ def test_distances_agree_with_the_errors_of_geometry() -> None:
     a, b = on_sphere(0, 20), on_sphere(30, 40, 5.0)
     limit = Limit(10.0, 2.0)
     expected = max(rotation_error_deg(a, b) / 10, translation_error(a, b) / 2)
-    assert limit.of(a, b) == pytest.approx(expected)
+    assert limit.distance_ratio(a, b) == pytest.approx(expected)
     assert pairwise(a[None], b[None], limit)[0, 0] == pytest.approx(expected)
 
 

@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fieldpose.stages.tracking.track_policy import TrackPolicy
-from fieldpose.stages.nerf.training_views import TrainingViews
 from support.tracking_world import World, hand_held, on_sphere, ring_of_views
 
 from fieldpose.bus.messages import GuessReason, TrackingState
 from fieldpose.errors import ConfigError
+from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.tracking.config import TrackingConfig
 from fieldpose.stages.tracking.core import Tracker
 from fieldpose.stages.tracking.policy import PoseResult

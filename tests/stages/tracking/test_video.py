@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from fieldpose.stages.tracking.retrieved import RetrievedPoses
+from fieldpose.stages.tracking.track_policy import TrackPolicy
 from support.tracking_world import on_sphere, ring_of_views
 
 from fieldpose.bus.messages import GuessReason, TrackingState
 from fieldpose.stages.geometry import rotation_error_deg
 from fieldpose.stages.tracking.config import TrackingConfig
 from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
-from fieldpose.stages.tracking.retrieved import RetrievedPoses
-from fieldpose.stages.tracking.track_policy import TrackPolicy
 
 MS = 1_000_000
 VIEWS = ring_of_views()

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fieldpose.stages.geometry import rotation_error_deg, translation_error
+from fieldpose.stages.geometry.errors import rotation_error_deg, translation_error
+from fieldpose.stages.geometry.rigid import camera_centres
 
 
 @dataclass(frozen=True)
@@ -16,25 +17,21 @@ class Limit:
     angle_deg: float
     distance: float
 
-    def of(self, a: np.ndarray, b: np.ndarray) -> float:
+    def distance_ratio(self, a: np.ndarray, b: np.ndarray) -> float:
         """How far apart two poses are in multiples of this limit, the worse of angle and distance."""
         angle = rotation_error_deg(a, b) / max(self.angle_deg, 1e-9)
         return max(angle, translation_error(a, b) / max(self.distance, 1e-12))
 
     def holds(self, a: np.ndarray, b: np.ndarray) -> bool:
-        return self.of(a, b) <= 1.0
+        """Whether each of two poses lies in the other's neighbourhood."""
+        return self.distance_ratio(a, b) <= 1.0
 
 
 def pairwise(poses: np.ndarray, others: np.ndarray, limit: Limit) -> np.ndarray:
-    """Limit.of of every pose (n, 4, 4) with every other (m, 4, 4), as (n, m)."""
+    """Limit.distance_ratio of every pose (n, 4, 4) with every other (m, 4, 4), as (n, m)."""
     rotations, other_rotations = poses[:, :3, :3], others[:, :3, :3]
     traces = np.einsum("nij,mij->nm", rotations, other_rotations)
     angles = np.rad2deg(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
-    centres, other_centres = centres_of(poses), centres_of(others)
+    centres, other_centres = camera_centres(poses), camera_centres(others)
     distances = np.linalg.norm(centres[:, None] - other_centres[None], axis=-1)
     return np.maximum(angles / max(limit.angle_deg, 1e-9), distances / max(limit.distance, 1e-12))
-
-
-def centres_of(poses: np.ndarray) -> np.ndarray:
-    """Camera centres (n, 3) in object coordinates of cam_from_object (n, 4, 4)."""
-    return -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])

@@ -1,0 +1,41 @@
+"""Images in memory: shrinking them, alone or with their camera, and decoding them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from fieldpose.stages.geometry import Camera, shrunk_size
+
+
+def shrunk(image: np.ndarray, longer_side: int) -> np.ndarray:
+    """An image (h, w) or (h, w, k), averaged over areas so that its longer side is at most `longer_side`.
+
+    The image itself where it is no larger.
+    """
+    height, width = image.shape[:2]
+    size = shrunk_size(width, height, longer_side)
+    return image if size == (width, height) else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def shrunk_with_camera(image: np.ndarray, camera: Camera, longer_side: int | None) -> tuple[np.ndarray, Camera]:
+    """As `shrunk`, and the camera of the result; None leaves both as they are."""
+    if longer_side is None:
+        return image, camera
+    return shrunk(image, longer_side), camera.shrunk(longer_side)
+
+
+def decoded(encoding: str, image: np.ndarray, width: int, height: int) -> np.ndarray | None:
+    """An image (height, width, 3) uint8 RGB: `rgb8` as it is, else from the bytes (n,) uint8 of a jpeg or png file.
+
+    EXIF orientation is ignored. None where the bytes are no image of that size.
+    """
+    if encoding == "rgb8":
+        return image
+    try:
+        bgr = cv2.imdecode(image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:
+        return None
+    if bgr is None or bgr.shape[:2] != (height, width):
+        return None
+    return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)

@@ -88,6 +88,8 @@ class Message(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         for name, (dtype, shape) in self._arrays.items():
+            if getattr(self, name) is None and "None" not in type(self).__annotations__[name]:
+                raise ValueError(f"{name}: missing")
             check_array(name, getattr(self, name), dtype, shape)
         for name in self.__struct_fields__:
             value = getattr(self, name)

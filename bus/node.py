@@ -115,12 +115,14 @@ class JoinedHandler:
 
     def _answered(self, joined: Joined) -> Message | Reason:
         needed = [topic for topic in joined.missing if topic not in self.optional]
-        if joined.missing:
-            self._throttle.warning("input missing", inputs=", ".join(topic.name for topic in joined.missing))
         if needed:
+            self._throttle.warning("input missing", inputs=", ".join(topic.name for topic in needed))
             return Reason.FRAME_MISSING if FRAME in needed else Reason.INPUT_MISSING
         try:
-            return self.answer(joined)
+            answer: object = self.answer(joined)
+            if not isinstance(answer, Message | Reason):
+                raise TypeError(f"answered with a {type(answer).__name__}")
+            return answer
         except Exception as error:
             self.failed += 1
             self._throttle.warning("failed", error=describe(error))
@@ -216,7 +218,7 @@ class _Node:
             for topic, message in work():
                 if topic not in self._handler.outputs:
                     raise ValueError(f"{topic.name} is not among the outputs of {self._handler.name}")
-                self._outbox.publish(topic, message)
+                self._publish(topic, message)
         except EndOfInput:
             raise
         except Exception as error:
@@ -224,6 +226,18 @@ class _Node:
             self._throttle.warning("failed", error=describe(error))
         if self._outbox.published > before:
             self._busy_ms.append((time.perf_counter() - started) * 1e3)
+
+    def _publish(self, topic: Topic[Any], message: Message) -> None:
+        """Send a message, or where that cannot be sent a Failure in its place; what else there is to send goes on."""
+        try:
+            self._outbox.publish(topic, message)
+        except CodecError as error:
+            self._failed += 1
+            self._throttle.warning("failed", error=describe(error))
+            if FAILURE in self._handler.outputs and topic is not FAILURE:
+                header = reply_header(message.header)
+                failure = Failure(header=header, stage=self._handler.name, reason=Reason.INTERNAL_ERROR)
+                self._outbox.publish(FAILURE, failure)
 
     def _refused(self, topic: Topic[Any], error: CodecError) -> None:
         self._throttle.warning("refused", topic=topic.name, error=str(error))

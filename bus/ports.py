@@ -46,7 +46,10 @@ class Outbox:
         sent.header = msgspec.structs.replace(
             message.header, source=self._source, sequence=sequence, sent_ns=time.time_ns()
         )
-        self._bus.put(self._address.key(topic, self._source), encode(sent), topic)
+        payload = encode(sent)
+        if len(payload) > topic.max_bytes:
+            raise CodecError(f"{topic.name}: {len(payload)} bytes where at most {topic.max_bytes} are received")
+        self._bus.put(self._address.key(topic, self._source), payload, topic)
         self._sequence[topic.name] = sequence + 1
         self.published += 1
 

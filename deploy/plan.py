@@ -103,10 +103,9 @@ def _rendering(
         config, notes["view size"] = replace(config, size=size), f"{size} (auto: {sequence})"
     if config.reuse_angle_deg is None:
         angle_deg = 0.0 if independent else VIDEO_REUSE_DEG
-        told = (
-            "at the very same pose, so that no frame depends on another" if independent else f"within {angle_deg:g} deg"
-        )
-        config, notes["views used again"] = replace(config, reuse_angle_deg=angle_deg), f"{told} (auto)"
+        told = "at the very same pose alone" if independent else f"within {angle_deg:g} degrees"
+        why = "frames stand each by itself" if independent else sequence
+        config, notes["views used again"] = replace(config, reuse_angle_deg=angle_deg), f"{told} (auto: {why})"
     return config
 
 

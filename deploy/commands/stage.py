@@ -84,11 +84,11 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     threads = options.threads or threads_of(row, settings.tracking.depth)
     os.environ.update(thread_environment(threads))
     parts = Parts(resolve(settings, _views(options.field), options.field), threads)
-    _tell(parts.plan, row)
     if options.field is not None and row.renders:
         compile_kernels(options.field, row.name)
     address = settings.address
     bus = ZenohBus(options.connect, options.listen or peer_address(options.connect))
+    _tell(parts.plan, row)
 
     def wait_until_ready() -> None:
         wait_for(bus, address, options.wait_for, _START_S)

@@ -214,12 +214,10 @@ class TestSendingSide:
         with pytest.raises(CodecError):
             decode(encode(sent), messages.Failure)
 
-    @pytest.mark.parametrize("width", [6.0, "6", np.int64(6)])
+    @pytest.mark.parametrize("width", [6.0, np.int64(6), np.float32(6)])
     def test_a_camera_of_wrong_types_is_refused_by_the_receiver_or_before(self, width: Any) -> None:
         sent = guess()
-        sent.camera = Camera(int(width), 4, 5.0, 5.0, 2.5, 1.5)
-        decode(encode(sent), messages.Guess)
-        object.__setattr__(sent, "camera", unchecked_camera(width))
+        sent.camera = msgspec.structs.replace(CAMERA, width=width)
         with pytest.raises(CodecError):
             decode(encode(sent), messages.Guess)
 
@@ -244,7 +242,7 @@ class TestRefusals:
             return
         accepted = getattr(message, name)
         assert isinstance(accepted, int | float)
-        assert accepted == fields[name]
+        assert accepted == pytest.approx(fields[name])
         assert np.isfinite(accepted)
 
     @pytest.mark.parametrize("topic", [topics.ESTIMATE, topics.POSE], ids=lambda topic: topic.name)
@@ -453,7 +451,7 @@ class TestOlderMessages:
         del older["camera_origin"]
         message: Any = decode(msgpack.packb(older), topic.message_type)
         assert message.camera_origin is CameraOrigin.CALIBRATED
-        assert message.camera == SAMPLES[topic].camera  # type: ignore[attr-defined]
+        assert message.camera == SAMPLES[topic].camera
 
     @every_topic
     def test_nothing_else_has_a_default(self, topic: Topic[Any]) -> None:

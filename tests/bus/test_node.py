@@ -9,14 +9,15 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from itertools import pairwise
+from typing import Any
 
 import pytest
-from support.bus_samples import ADDRESS, frame, guess, matches, view
+from support.bus_samples import ADDRESS, camera_info, frame, guess, matches, prior, view
 
-from fieldpose.bus.messages import Header, Matches, Message, Reason, Stats
-from fieldpose.bus.node import EndOfInput, Handler, JoinedHandler, Output, reply_header, run_node
+from fieldpose.bus.messages import Failure, Matches, Message, Reason, Stats
+from fieldpose.bus.node import EndOfInput, Handler, Joined, JoinedHandler, Output, run_node
 from fieldpose.bus.ports import Inbox, Outbox, Received
-from fieldpose.bus.topics import FRAME, GUESS, MATCHES, STATS, TRUTH, VIEW, Topic
+from fieldpose.bus.topics import CAMERA_INFO, FAILURE, FRAME, GUESS, MATCHES, PRIOR, STATS, TRUTH, VIEW, Topic
 from fieldpose.bus.transport import MemoryBus, ZenohBus, wait_for
 
 Connect = Callable[[str], ZenohBus]
@@ -24,35 +25,45 @@ Spawn = Callable[..., "subprocess.Popen[str]"]
 
 
 class Matching(JoinedHandler):
-    """A stage in small: frame 13 is beyond it, frame 14 fails half way."""
+    """A stage in small: frame 12 is too hard, frame 13 is beyond it."""
 
     name = "matching"
     inputs = (VIEW, FRAME)
-    outputs = (MATCHES,)
+    output = MATCHES
     join_timeout_s = 0.1
 
-    def process(self, joined: dict[Topic, Message]) -> Iterator[Output]:
+    def answer(self, joined: Joined) -> Message | Reason:
         frame_id = joined[FRAME].header.frame_id
+        if frame_id == 12:
+            return Reason.TOO_FEW_MATCHES
         if frame_id == 13:
             raise RuntimeError("beyond me")
-        yield MATCHES, matches(reply_header(joined[VIEW].header), count=frame_id)
-        if frame_id == 14:
-            raise RuntimeError("half way")
+        return matches(joined.header, count=frame_id)
 
-    def failure(self, header: Header, reason: Reason) -> Iterator[Output]:
-        yield MATCHES, matches(reply_header(header), count=0, ok=False, reason=reason)
+
+class Lenient(JoinedHandler):
+    """A stage that can do without the prior, and needs camera and guess."""
+
+    name = "pnp"
+    inputs: tuple[Topic[Any], ...] = (VIEW, CAMERA_INFO, GUESS, PRIOR)
+    output = MATCHES
+    optional: tuple[Topic[Any], ...] = (PRIOR,)
+    join_timeout_s = 0.1
+
+    def answer(self, joined: Joined) -> Message | Reason:
+        return matches(joined.header, count=1 if joined.get(PRIOR) is None else 2)
 
 
 class Plain:
     """A handler made of functions."""
 
     name = "tracking"
-    inputs: tuple[Topic, ...] = (GUESS,)
-    outputs: tuple[Topic, ...] = (GUESS,)
+    inputs: tuple[Topic[Any], ...] = (GUESS,)
+    outputs: tuple[Topic[Any], ...] = (GUESS,)
 
     def __init__(
         self,
-        handle: Callable[[Topic, Message], Iterable[Output]] = lambda topic, message: (),
+        handle: Callable[[Topic[Any], Message], Iterable[Output]] = lambda topic, message: (),
         tick: Callable[[int], Iterable[Output]] = lambda now_ns: (),
         start: Callable[[], None] = lambda: None,
     ) -> None:
@@ -77,15 +88,31 @@ def running(handler: Handler, bus: MemoryBus, stats_period_s: float = 0.5) -> It
         assert not thread.is_alive()
 
 
-def listen(bus: MemoryBus, *topics: Topic) -> Inbox:
+def listen(bus: MemoryBus, *topics: Topic[Any]) -> Inbox:
     return Inbox(bus, ADDRESS, topics)
 
 
 def answer(inbox: Inbox) -> Matches:
     received = inbox.get(5.0)
     assert received is not None
+    assert received.topic is MATCHES
     assert isinstance(received.message, Matches)
     return received.message
+
+
+def refusal(inbox: Inbox) -> Failure:
+    received = inbox.get(5.0)
+    assert received is not None
+    assert received.topic is FAILURE
+    assert isinstance(received.message, Failure)
+    return received.message
+
+
+def only(outputs: Iterable[Output]) -> Message:
+    """The one failure or result that a handler answers, on the topic that is its."""
+    ((topic, message),) = outputs
+    assert topic is (FAILURE if isinstance(message, Failure) else MATCHES)
+    return message
 
 
 def stats(inbox: Inbox) -> list[Stats]:
@@ -99,7 +126,7 @@ class TestJoined:
 
     @pytest.fixture
     def ends(self, bus: MemoryBus) -> Iterator[tuple[Outbox, Inbox]]:
-        inbox = listen(bus, MATCHES)
+        inbox = listen(bus, MATCHES, FAILURE)
         with running(Matching(), bus):
             yield Outbox(bus, ADDRESS, "test"), inbox
 
@@ -119,44 +146,60 @@ class TestJoined:
         assert {each.header.source for each in answers} == {"matching"}
         assert answers[0].header.capture_ns == 1003
 
-    @pytest.mark.parametrize("frame_id", [13, 14])
-    def test_an_exception_is_one_failed_answer_and_the_process_goes_on(
-        self, ends: tuple[Outbox, Inbox], frame_id: int
+    def test_it_sends_results_on_its_output_and_failures_on_theirs(self) -> None:
+        assert Matching().outputs == (MATCHES, FAILURE)
+
+    @pytest.mark.parametrize(
+        ("frame_id", "reason"), [(12, Reason.TOO_FEW_MATCHES), (13, Reason.INTERNAL_ERROR)], ids=["reason", "exception"]
+    )
+    def test_a_reason_or_an_exception_is_one_failure_and_the_process_goes_on(
+        self, ends: tuple[Outbox, Inbox], frame_id: int, reason: Reason
     ) -> None:
         outbox, inbox = ends
-        for each in (frame_id, 2):
+        for each, pass_index in ((frame_id, 1), (2, 0)):
             outbox.publish(FRAME, frame(each))
-            outbox.publish(VIEW, view(each))
-        failed, good = answer(inbox), answer(inbox)
-        assert (failed.ok, failed.reason, failed.header.frame_id) == (False, Reason.INTERNAL_ERROR, frame_id)
-        assert (good.ok, good.header.frame_id) == (True, 2)
+            outbox.publish(VIEW, view(each, pass_index))
+        failed, good = refusal(inbox), answer(inbox)
+        assert (failed.stage, failed.reason) == ("matching", reason)
+        assert (failed.header.frame_id, failed.header.pass_index, failed.header.capture_ns) == (
+            frame_id,
+            1,
+            1000 + frame_id,
+        )
+        assert (failed.header.source, failed.header.sequence) == ("matching", 0)
+        assert (good.header.frame_id, good.header.sequence, len(good.confidence)) == (2, 0, 2)
         assert inbox.get(0.05) is None
 
-    def test_a_failure_upstream_is_passed_on_at_once_with_its_reason(self, ends: tuple[Outbox, Inbox]) -> None:
-        outbox, inbox = ends
-        outbox.publish(VIEW, view(5, ok=False, reason=Reason.NOTHING_IN_VIEW))
-        failed = answer(inbox)
-        assert (failed.ok, failed.reason, failed.header.frame_id) == (False, Reason.NOTHING_IN_VIEW, 5)
+    def test_an_exception_counts_as_failed_and_a_reason_does_not(self) -> None:
+        handler = Matching()
+        for frame_id in (12, 13):
+            list(handler.handle(FRAME, frame(frame_id)))
+            assert isinstance(only(handler.handle(VIEW, view(frame_id))), Failure)
+        assert handler.failed == 1
 
-    def test_a_frame_that_does_not_come_is_a_failed_answer(self, ends: tuple[Outbox, Inbox]) -> None:
+    def test_a_frame_that_does_not_come_is_a_failure(self, ends: tuple[Outbox, Inbox]) -> None:
         outbox, inbox = ends
         started = time.monotonic()
-        outbox.publish(VIEW, view(5))
-        failed = answer(inbox)
-        assert (failed.ok, failed.reason, failed.header.frame_id) == (False, Reason.FRAME_MISSING, 5)
+        outbox.publish(VIEW, view(5, pass_index=1))
+        failed = refusal(inbox)
+        assert (failed.stage, failed.reason) == ("matching", Reason.FRAME_MISSING)
+        assert (failed.header.frame_id, failed.header.pass_index) == (5, 1)
         assert 0.08 < time.monotonic() - started < 2.0
+        assert inbox.get(0.05) is None
 
-    def test_an_exception_over_incomplete_inputs_is_a_failed_answer_too(self) -> None:
-        class Lenient(Matching):
-            def incomplete(self, joined: dict[Topic, Message], reason: Reason) -> Iterable[Output]:
-                return self.process(joined)
+    def test_what_does_not_drive_is_never_answered(self, ends: tuple[Outbox, Inbox]) -> None:
+        outbox, inbox = ends
+        outbox.publish(FRAME, frame(5))
+        assert inbox.get(0.3) is None
 
-        handler = Lenient()
-        assert not list(handler.handle(VIEW, view(5)))
-        ((topic, failed),) = handler.tick(2**62)
-        assert topic is MATCHES
-        assert isinstance(failed, Matches)
-        assert (failed.ok, failed.reason, handler.failed) == (False, Reason.INTERNAL_ERROR, 1)
+    def test_every_message_that_drives_is_answered_though_there_are_too_many_to_wait(self) -> None:
+        handler = Matching()
+        replies = [each for frame_id in range(200) for each in handler.handle(VIEW, view(frame_id))]
+        replies += handler.tick(2**62)
+        failed = [message for topic, message in replies if topic is FAILURE]
+        assert [message.header.frame_id for message in failed] == list(range(200))
+        assert {message.reason for message in failed if isinstance(message, Failure)} == {Reason.FRAME_MISSING}
+        assert list(handler.tick(2**62)) == []
 
     def test_frames_are_kept_though_the_topic_is_newest_only(self, ends: tuple[Outbox, Inbox]) -> None:
         outbox, inbox = ends
@@ -164,7 +207,7 @@ class TestJoined:
             outbox.publish(FRAME, frame(frame_id))
         for frame_id in (100, 130, 163):
             outbox.publish(VIEW, view(frame_id))
-        assert [answer(inbox).ok for _ in range(3)] == [True, True, True]
+        assert [answer(inbox).header.frame_id for _ in range(3)] == [100, 130, 163]
 
     def test_exceptions_are_counted_and_logged_once_a_second(
         self, bus: MemoryBus, capsys: pytest.CaptureFixture[str]
@@ -184,12 +227,123 @@ class TestJoined:
         assert "test_node.py" in captured.err
 
 
+class TestMissingInputs:
+    """Of the view, its camera, its guess and its prior, the stage can do without the prior alone."""
+
+    def reply(self, *given: Topic[Any], handler: JoinedHandler | None = None) -> Message:
+        handler = handler or Lenient()
+        samples = {VIEW: view(1), CAMERA_INFO: camera_info(1), GUESS: guess(1), PRIOR: prior(1), FRAME: frame(1)}
+        early = [each for topic in given for each in handler.handle(topic, samples[topic])]
+        late = list(handler.tick(2**62))
+        assert not (early and late)
+        assert bool(early) == (set(given) == set(handler.inputs))
+        return only(early + late)
+
+    def test_all_of_them_are_answered_at_once(self) -> None:
+        answered = self.reply(CAMERA_INFO, GUESS, VIEW, PRIOR)
+        assert isinstance(answered, Matches)
+        assert len(answered.confidence) == 2
+
+    def test_an_optional_one_is_waited_for_and_then_done_without(self) -> None:
+        answered = self.reply(CAMERA_INFO, GUESS, VIEW)
+        assert isinstance(answered, Matches)
+        assert len(answered.confidence) == 1
+        assert (answered.header.frame_id, answered.header.capture_ns) == (1, 1001)
+
+    def test_an_optional_one_that_comes_in_time_is_used(self) -> None:
+        handler = Lenient()
+        for topic, message in ((VIEW, view(1)), (CAMERA_INFO, camera_info(1)), (GUESS, guess(1))):
+            assert list(handler.handle(topic, message)) == []
+        assert list(handler.tick(time.time_ns())) == []
+        answered = only(handler.handle(PRIOR, prior(1)))
+        assert isinstance(answered, Matches)
+        assert len(answered.confidence) == 2
+        assert list(handler.tick(2**62)) == []
+
+    @pytest.mark.parametrize(
+        "given", [(VIEW,), (VIEW, GUESS), (VIEW, CAMERA_INFO), (VIEW, GUESS, PRIOR), (VIEW, CAMERA_INFO, PRIOR)]
+    )
+    def test_one_that_is_needed_is_a_failure(self, given: tuple[Topic[Any], ...]) -> None:
+        failed = self.reply(*given)
+        assert isinstance(failed, Failure)
+        assert (failed.stage, failed.reason, failed.header.frame_id) == ("pnp", Reason.INPUT_MISSING, 1)
+
+    def test_a_frame_among_them_is_what_the_failure_tells(self) -> None:
+        class Greedy(Lenient):
+            inputs = (VIEW, GUESS, FRAME, PRIOR)
+
+        for given, reason in (((VIEW,), Reason.FRAME_MISSING), ((VIEW, FRAME), Reason.INPUT_MISSING)):
+            failed = self.reply(*given, handler=Greedy())
+            assert isinstance(failed, Failure)
+            assert failed.reason is reason
+
+    def test_a_frame_may_be_optional(self) -> None:
+        class Blind(Lenient):
+            inputs = (VIEW, GUESS, FRAME)
+            optional = (FRAME,)
+
+        assert isinstance(self.reply(VIEW, GUESS, handler=Blind()), Matches)
+        failed = self.reply(VIEW, handler=Blind())
+        assert isinstance(failed, Failure)
+        assert failed.reason is Reason.INPUT_MISSING
+
+    def test_a_stage_that_takes_an_optional_one_for_granted_fails_as_by_any_exception(self) -> None:
+        class Careless(Lenient):
+            def answer(self, joined: Joined) -> Message | Reason:
+                return matches(joined[PRIOR].header)
+
+        handler = Careless()
+        failed = self.reply(VIEW, CAMERA_INFO, GUESS, handler=handler)
+        assert isinstance(failed, Failure)
+        assert (failed.reason, handler.failed) == (Reason.INTERNAL_ERROR, 1)
+
+    def test_a_process_does_without_an_optional_one_too(self) -> None:
+        bus = MemoryBus()
+        inbox = listen(bus, MATCHES, FAILURE)
+        with running(Lenient(), bus):
+            outbox = Outbox(bus, ADDRESS, "test")
+            outbox.publish(CAMERA_INFO, camera_info(1))
+            for pass_index in (0, 1):
+                outbox.publish(GUESS, guess(1, pass_index))
+                outbox.publish(VIEW, view(1, pass_index))
+            answers = [answer(inbox) for _ in range(2)]
+        assert [(each.header.pass_index, len(each.confidence)) for each in answers] == [(0, 1), (1, 1)]
+
+
+class TestFailures:
+    def test_several_processes_fail_on_one_topic_and_nobody_sees_a_gap(self) -> None:
+        bus = MemoryBus()
+        numbers, inbox = listen(bus, STATS), listen(bus, FAILURE)
+        heard: list[Message] = []
+
+        def hear(topic: Topic[Any], message: Message) -> Iterable[Output]:
+            heard.append(message)
+            return ()
+
+        tracking = Plain(hear)
+        tracking.inputs = (FAILURE,)
+        with running(tracking, bus, 0.05), running(Matching(), bus), running(Lenient(), bus):
+            outbox = Outbox(bus, ADDRESS, "test")
+            for frame_id in range(6):
+                outbox.publish(VIEW, view(frame_id))
+                outbox.publish(VIEW, view(frame_id, pass_index=1))
+            received = [refusal(inbox) for _ in range(24)]
+            time.sleep(0.1)
+        for stage, reason in (("matching", Reason.FRAME_MISSING), ("pnp", Reason.INPUT_MISSING)):
+            failures = [each for each in received if each.header.source == stage]
+            assert [each.header.sequence for each in failures] == list(range(12))
+            assert {(each.stage, each.reason) for each in failures} == {(stage, reason)}
+        assert inbox.counts.gaps == 0
+        assert len(heard) == 24
+        assert [each for each in stats(numbers) if each.stage == "tracking"][-1].gaps == 0
+
+
 class TestPlain:
     def test_a_message_is_handled_at_once(self) -> None:
         bus = MemoryBus()
         delays_ms: list[float] = []
 
-        def handle(topic: Topic, message: Message) -> Iterable[Output]:
+        def handle(topic: Topic[Any], message: Message) -> Iterable[Output]:
             delays_ms.append((time.time_ns() - message.header.sent_ns) / 1e6)
             return ()
 
@@ -209,7 +363,7 @@ class TestPlain:
             ticks.append(now_ns / 1e9)
             return ()
 
-        def pause(topic: Topic, message: Message) -> Iterable[Output]:
+        def pause(topic: Topic[Any], message: Message) -> Iterable[Output]:
             time.sleep(0.005)
             return ()
 
@@ -246,7 +400,7 @@ class TestPlain:
         bus = MemoryBus()
         numbers, handled = listen(bus, STATS), []
 
-        def handle(topic: Topic, message: Message) -> Iterable[Output]:
+        def handle(topic: Topic[Any], message: Message) -> Iterable[Output]:
             handled.append(message)
             return ()
 
@@ -310,7 +464,7 @@ class TestStats:
         numbers = listen(bus, STATS)
         release = threading.Event()
 
-        def hang(topic: Topic, message: Message) -> Iterable[Output]:
+        def hang(topic: Topic[Any], message: Message) -> Iterable[Output]:
             release.wait(5.0)
             return ()
 
@@ -328,7 +482,7 @@ class TestStats:
         bus = MemoryBus()
         numbers = listen(bus, STATS)
 
-        def work(topic: Topic, message: Message) -> Iterator[Output]:
+        def work(topic: Topic[Any], message: Message) -> Iterator[Output]:
             if message.header.frame_id > 0:
                 time.sleep(0.02)
                 yield TRUTH, message

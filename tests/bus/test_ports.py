@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from typing import Any
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.bus_samples import ADDRESS, frame, guess, truth, view
+from support.bus_samples import ADDRESS, camera_info, failure, frame, guess, prior, truth, view
 
-from fieldpose.bus.joining import Joiner
-from fieldpose.bus.messages import Header
+from fieldpose.bus.joining import Joined, Joiner
+from fieldpose.bus.messages import Header, Message, Reason
 from fieldpose.bus.ports import Inbox, Outbox, Sequences, reply_header
-from fieldpose.bus.topics import FRAME, GUESS, TRUTH, VIEW, Topic
+from fieldpose.bus.topics import ALL, CAMERA_INFO, FAILURE, FRAME, GUESS, PRIOR, TRUTH, VIEW, Topic
 from fieldpose.bus.transport import MemoryBus
 from fieldpose.errors import CodecError
 
@@ -81,7 +84,7 @@ class TestOutbox:
 class TestInbox:
     def test_what_is_no_message_is_refused_told_and_passed_over(self) -> None:
         bus = MemoryBus()
-        told: list[tuple[Topic, str]] = []
+        told: list[tuple[Topic[Any], str]] = []
         inbox = Inbox(bus, ADDRESS, [GUESS], refused=lambda topic, error: told.append((topic, str(error))))
         bus.put(ADDRESS.key(GUESS), b"rubbish", GUESS)
         Outbox(bus, ADDRESS, "tracking").publish(GUESS, guess(5))
@@ -91,6 +94,33 @@ class TestInbox:
         assert (inbox.counts.refused, inbox.counts.received) == (1, 1)
         assert told[0][0] is GUESS
         assert told[0][1].startswith("Guess: ")
+
+    def test_several_senders_on_the_one_failure_topic_are_counted_each_by_itself(self) -> None:
+        bus = MemoryBus()
+        inbox = Inbox(bus, ADDRESS, [FAILURE])
+        stages = ("matching", "lifting", "pnp")
+        outboxes = {stage: Outbox(bus, ADDRESS, stage) for stage in stages}
+        failing = [stages[n] for n in (0, 0, 0, 2, 1, 0, 2, 2, 1, 0)]
+        for frame_id, stage in enumerate(failing):
+            outboxes[stage].publish(FAILURE, failure(frame_id, stage))
+        received = inbox.drain()
+        assert [item.message.header.source for item in received] == failing
+        assert [item.message.header.sequence for item in received] == [0, 1, 2, 0, 0, 3, 1, 2, 1, 4]
+        assert {item.key for item in received} == {"test/track/mug/cam/failure"}
+        assert (inbox.counts.received, inbox.counts.gaps, inbox.counts.skipped) == (10, 0, 0)
+
+    def test_a_failure_that_is_lost_is_a_gap_of_its_sender_alone(self) -> None:
+        bus = MemoryBus()
+        inbox = Inbox(bus, ADDRESS, [FAILURE], {FAILURE: 3})
+        pnp, lifting = Outbox(bus, ADDRESS, "pnp"), Outbox(bus, ADDRESS, "lifting")
+        for sender in (pnp, lifting):
+            sender.publish(FAILURE, failure(0))
+        assert len(inbox.drain()) == 2
+        for frame_id in (1, 2, 3):
+            pnp.publish(FAILURE, failure(frame_id, "pnp", Reason.NO_CONSENSUS))
+        lifting.publish(FAILURE, failure(4, "lifting", Reason.TOO_FEW_CONSISTENT_POINTS))
+        assert [item.message.header.frame_id for item in inbox.drain()] == [2, 3, 4]
+        assert inbox.counts.gaps == 1
 
     def test_a_fast_camera_does_not_starve_other_topics_nor_they_it(self) -> None:
         bus = MemoryBus()
@@ -108,25 +138,63 @@ class TestInbox:
         assert order.count(GUESS) >= 3
 
 
-def joined_ids(results: object) -> list[tuple[int, int]]:
-    return [(each.inputs[VIEW].header.frame_id, each.inputs[VIEW].header.pass_index) for each in results]  # type: ignore
+def joined_ids(results: Iterable[Joined]) -> list[tuple[int, int]]:
+    return [(each[VIEW].header.frame_id, each[VIEW].header.pass_index) for each in results]
+
+
+ONE_A_FRAME: dict[Topic[Any], Callable[[int], Message]] = {
+    FRAME: frame,
+    CAMERA_INFO: camera_info,
+    TRUTH: truth,
+    PRIOR: prior,
+}
+one_a_frame = pytest.mark.parametrize("topic", ONE_A_FRAME, ids=lambda topic: topic.name)
+
+
+class TestJoined:
+    def test_it_has_the_header_of_the_answer(self) -> None:
+        driving = view(4, pass_index=2)
+        driving.header = Header("rendering", 9, 4, 2, 1004, 2000)
+        (joined,) = Joiner((VIEW,)).add(VIEW, driving, 0)
+        assert joined.header == Header("", 0, 4, 2, 1004, 0)
+        assert joined[VIEW] is driving
+
+    def test_an_input_that_is_missing_is_a_key_error_that_names_it_or_none(self) -> None:
+        joined = Joined(view(4).header, {VIEW: view(4)}, (FRAME,))
+        assert joined.get(FRAME) is None
+        assert joined.missing == (FRAME,)
+        with pytest.raises(KeyError, match="frame"):
+            joined[FRAME]
+
+    def test_the_passes_of_a_frame_have_its_key_and_another_frame_of_that_id_has_not(self) -> None:
+        headers = [Header("", 0, 4, 0, 1004, 0), Header("", 0, 4, 1, 1004, 5), Header("", 0, 4, 0, 9004, 0)]
+        first, second, after_a_restart = (Joined(header, {}).frame_key for header in headers)
+        assert first == second != after_a_restart
 
 
 class TestJoiner:
     def test_any_order_of_arrival(self) -> None:
-        for first, second in [((FRAME, frame(1)), (VIEW, view(1))), ((VIEW, view(1)), (FRAME, frame(1)))]:
+        arrivals: list[tuple[Topic[Any], Message]] = [(FRAME, frame(1)), (VIEW, view(1))]
+        for first, second in (arrivals, arrivals[::-1]):
             joiner = Joiner((VIEW, FRAME))
             assert list(joiner.add(*first, 0)) == []
             (joined,) = joiner.add(*second, 0)
-            assert joined.inputs[FRAME].header.frame_id == joined.inputs[VIEW].header.frame_id == 1
+            assert joined[FRAME].header.frame_id == joined[VIEW].header.frame_id == joined.header.frame_id == 1
             assert joined.missing == ()
 
-    def test_a_frame_serves_every_pass_and_comes_out_once_for_each(self) -> None:
-        joiner = Joiner((VIEW, FRAME))
-        list(joiner.add(FRAME, frame(1), 0))
-        assert joined_ids(joiner.add(VIEW, view(1, 0), 0)) == [(1, 0)]
-        assert joined_ids(joiner.add(VIEW, view(1, 1), 0)) == [(1, 1)]
-        assert list(joiner.add(FRAME, frame(1), 0)) == []
+    def test_only_what_a_camera_and_the_outside_send_is_there_once_a_frame(self) -> None:
+        assert {topic for topic in ALL if topic.of_frame} == set(ONE_A_FRAME)
+
+    @one_a_frame
+    def test_what_is_there_once_a_frame_serves_every_pass_and_comes_out_once_for_each(self, topic: Topic[Any]) -> None:
+        joiner = Joiner((VIEW, topic))
+        sent = ONE_A_FRAME[topic](1)
+        list(joiner.add(topic, sent, 0))
+        for pass_index in (0, 1, 2):
+            (joined,) = joiner.add(VIEW, view(1, pass_index), 0)
+            assert joined[topic] is sent
+            assert joined.header.pass_index == pass_index
+        assert list(joiner.add(topic, sent, 0)) == []
 
     def test_other_inputs_are_joined_by_pass_too_and_used_once(self) -> None:
         joiner = Joiner((VIEW, GUESS))
@@ -136,18 +204,29 @@ class TestJoiner:
         assert joined_ids(joiner.add(VIEW, view(1, 0), 0)) == [(1, 0)]
         assert list(joiner.add(VIEW, view(1, 0), 0)) == []
 
-    def test_several_passes_may_wait_for_one_frame(self) -> None:
-        joiner = Joiner((VIEW, FRAME))
+    @one_a_frame
+    def test_several_passes_may_wait_for_what_is_there_once_a_frame(self, topic: Topic[Any]) -> None:
+        joiner = Joiner((VIEW, topic))
         list(joiner.add(VIEW, view(1, 0), 0))
         list(joiner.add(VIEW, view(1, 1), 0))
-        assert joined_ids(joiner.add(FRAME, frame(1), 0)) == [(1, 0), (1, 1)]
+        assert joined_ids(joiner.add(topic, ONE_A_FRAME[topic](1), 0)) == [(1, 0), (1, 1)]
 
-    def test_frames_of_a_camera_that_started_again_are_not_taken_for_the_old(self) -> None:
-        joiner = Joiner((VIEW, FRAME))
-        old = frame(1, header=Header("", 0, 1, 0, 5, 0))
-        list(joiner.add(FRAME, old, 0))
+    @one_a_frame
+    def test_frames_of_a_camera_that_started_again_are_not_taken_for_the_old(self, topic: Topic[Any]) -> None:
+        joiner = Joiner((VIEW, topic))
+        old = ONE_A_FRAME[topic](1)
+        old.header = Header("", 0, 1, 0, 5, 0)
+        list(joiner.add(topic, old, 0))
         assert list(joiner.add(VIEW, view(1), 0)) == []
-        assert joined_ids(joiner.add(FRAME, frame(1), 0)) == [(1, 0)]
+        assert joined_ids(joiner.add(topic, ONE_A_FRAME[topic](1), 0)) == [(1, 0)]
+
+    def test_what_is_there_once_a_frame_may_drive(self) -> None:
+        joiner = Joiner((CAMERA_INFO, PRIOR))
+        assert list(joiner.add(CAMERA_INFO, camera_info(1), 0)) == []
+        assert list(joiner.add(PRIOR, prior(2), 0)) == []
+        (joined,) = joiner.add(PRIOR, prior(1), 0)
+        assert joined[CAMERA_INFO].camera == camera_info(1).camera
+        assert list(joiner.add(PRIOR, prior(1), 0)) == []
 
     def test_what_waits_too_long_comes_out_incomplete_once(self) -> None:
         joiner = Joiner((VIEW, FRAME, GUESS), timeout_s=1.0)
@@ -156,7 +235,8 @@ class TestJoiner:
         assert list(joiner.expire(SECOND_NS - 1)) == []
         (late,) = joiner.expire(SECOND_NS)
         assert late.missing == (FRAME,)
-        assert set(late.inputs) == {VIEW, GUESS}
+        assert late.get(FRAME) is None
+        assert late[VIEW].header.frame_id == late[GUESS].header.frame_id == 1
         assert list(joiner.expire(10 * SECOND_NS)) == []
         assert list(joiner.add(FRAME, frame(1), 0)) == []
 

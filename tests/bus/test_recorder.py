@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from support.bus_samples import ADDRESS, every_message, frame, guess, same, truth
+from support.bus_samples import ADDRESS, every_message, failure, frame, guess, same, truth
 
 from fieldpose.bus.codec import encode
 from fieldpose.bus.messages import Header
 from fieldpose.bus.ports import Inbox, Outbox
 from fieldpose.bus.recorder import RECORDED, Recorder, RecorderHandler, RecordingWriter, partial_path, recover
 from fieldpose.bus.replay import Attachment, info, read_recording
-from fieldpose.bus.topics import ALL, FRAME, GUESS, STATS, TRUTH, Address
+from fieldpose.bus.topics import ALL, FAILURE, FRAME, GUESS, STATE, STATS, TRUTH, Address
 from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus, wait_for
 from fieldpose.errors import RecordingError
 
@@ -63,6 +63,20 @@ class TestLive:
         (source,) = info(path).sources
         assert (source.received, source.written, source.missing) == (3, 3, 2 + 3)
         assert not info(path).lossless
+
+    def test_the_failures_of_several_stages_are_counted_by_stage(self, path: Path) -> None:
+        bus = MemoryBus()
+        recorder = Recorder(bus, EVERYTHING, path, from_start=True)
+        outboxes = {stage: Outbox(bus, ADDRESS, stage) for stage in ("lifting", "matching", "pnp")}
+        for frame_id, stage in enumerate(("pnp", "matching", "pnp", "lifting", "pnp", "matching")):
+            outboxes[stage].publish(FAILURE, failure(frame_id, stage))
+        assert recorder.close()
+        assert [(each.source, each.received, each.written, each.missing) for each in info(path).sources] == [
+            ("lifting", 1, 1, 0),
+            ("matching", 2, 2, 0),
+            ("pnp", 3, 3, 0),
+        ]
+        assert info(path).lossless
 
     def test_a_full_queue_drops_counts_and_says_so(self, path: Path) -> None:
         bus = MemoryBus()
@@ -125,6 +139,16 @@ class TestFile:
         assert (schema.name, schema.encoding) == ("Frame", "jsonschema")
         properties = json.loads(schema.data)["$defs"]["Frame"]["properties"]
         assert set(properties) == {"header", "image", "encoding", "camera", "camera_origin"}
+
+    def test_the_schema_says_which_fields_may_be_missing(self, path: Path) -> None:
+        writer = RecordingWriter(path)
+        writer.write(ADDRESS.key(STATE), STATE, every_message()[STATE], 300)
+        writer.close()
+        with open(path, "rb") as stream:
+            ((schema, _, _),) = make_reader(stream).iter_messages()
+        assert schema is not None
+        state = json.loads(schema.data)["$defs"]["State"]
+        assert set(state["properties"]) - set(state["required"]) == {"reason", "camera_origin"}
 
     def test_chunks_are_uncompressed_and_of_a_few_megabytes(self, path: Path) -> None:
         writer = RecordingWriter(path)

@@ -7,16 +7,18 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+import msgpack
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.bus_samples import ADDRESS, frame, guess, same, truth
+from support.bus_samples import ADDRESS, every_message, frame, guess, same, truth
 
-from fieldpose.bus.messages import Header
+from fieldpose.bus.codec import encode
+from fieldpose.bus.messages import CameraOrigin, Header
 from fieldpose.bus.ports import Inbox
 from fieldpose.bus.recorder import RecordingWriter, recover
 from fieldpose.bus.replay import Attachment, info, read_attachment, read_recording, replay
-from fieldpose.bus.topics import FRAME, GUESS, TRUTH, Address
+from fieldpose.bus.topics import FRAME, GUESS, STATE, TRUTH, Address
 from fieldpose.bus.transport import MemoryBus
 from fieldpose.errors import RecordingError
 
@@ -68,6 +70,17 @@ class TestReading:
         assert read_attachment(recording, "note") == b"hello"
         with pytest.raises(RecordingError, match="no attachment 'field'"):
             read_attachment(recording, "field")
+
+    def test_an_older_recording_is_read_whose_messages_lack_what_came_later(self, tmp_path: Path) -> None:
+        writer = RecordingWriter(tmp_path / "older.mcap")
+        for topic in (FRAME, STATE):
+            fields = msgpack.unpackb(encode(every_message()[topic]))
+            older = {name: value for name, value in fields.items() if name not in ("reason", "camera_origin")}
+            writer.write_payload(ADDRESS.key(topic), topic, msgpack.packb(older), 1)
+        assert writer.close()
+        older_frame, state = (each.message for each in read_recording(tmp_path / "older.mcap"))
+        assert same(older_frame, frame(3))
+        assert (state.reason, state.camera_origin) == (None, CameraOrigin.CALIBRATED)  # type: ignore[attr-defined]
 
     def test_a_forged_message_is_one_clear_line(self, tmp_path: Path) -> None:
         writer = RecordingWriter(tmp_path / "forged.mcap")

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TypeVar
 
 import pytest
-from support.bus_samples import ADDRESS, frame, guess, same, truth
+from support.bus_samples import ADDRESS, every_message, failure, frame, guess, same, truth
 
 from fieldpose.bus.ports import Inbox, Outbox
-from fieldpose.bus.topics import FRAME, GUESS, STATS, TRUTH, Address
+from fieldpose.bus.topics import ALL, BY_NAME, FAILURE, FRAME, GUESS, STATS, TRUTH, Address, topic_of
 from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus, serve_hub, wait_for
 from fieldpose.errors import TransportError
 
@@ -70,6 +70,35 @@ class TestContract:
         assert received is not None
         assert same(received.message.image, sent.image)  # type: ignore[attr-defined]
         assert not received.message.image.flags.writeable  # type: ignore[attr-defined]
+
+    def test_a_message_of_every_topic_arrives_as_it_was(self, sessions: Sessions) -> None:
+        sender, receiver = sessions
+        inbox = Inbox(receiver, ADDRESS, ALL)
+        meet(sender, receiver)
+        outbox = Outbox(sender, ADDRESS, "pnp")
+        for topic, message in every_message().items():
+            outbox.publish(topic, message)
+        received = [inbox.get(5.0) for _ in ALL]
+        assert {item.topic for item in received if item} == set(ALL)
+        for item in received:
+            assert item is not None
+            sent = every_message()[item.topic]
+            sent.header = item.message.header
+            assert same(item.message, sent)
+            assert item.key == ADDRESS.key(item.topic, "pnp")
+
+    def test_the_failures_of_several_stages_have_no_gaps(self, sessions: Sessions) -> None:
+        sender, receiver = sessions
+        inbox = Inbox(receiver, ADDRESS, [FAILURE])
+        meet(sender, receiver)
+        outboxes = [Outbox(sender, ADDRESS, stage) for stage in ("matching", "lifting", "pnp")]
+        for frame_id in range(30):
+            outboxes[frame_id * 7 % 3].publish(FAILURE, failure(frame_id))
+            outboxes[0].publish(FAILURE, failure(frame_id))
+        received = [inbox.get(5.0) for _ in range(60)]
+        sources = [item.message.header.source for item in received if item]
+        assert [sources.count(stage) for stage in ("matching", "lifting", "pnp")] == [40, 10, 10]
+        assert inbox.counts.gaps == 0
 
     def test_other_keys_do_not_arrive_and_wildcards_listen_to_several(self, sessions: Sessions) -> None:
         sender, receiver = sessions
@@ -184,6 +213,19 @@ class TestKeys:
     def test_stats_keys_name_the_stage(self) -> None:
         assert ADDRESS.key(STATS, "pnp") == "test/stats/mug/cam/pnp"
         assert STATS.address_of("test/stats/mug/cam/pnp") == ADDRESS
+
+    def test_every_key_leads_back_to_its_topic_alone(self) -> None:
+        keys = {topic: ADDRESS.key(topic, "pnp") for topic in ALL}
+        assert len(set(keys.values())) == len(set(BY_NAME)) == len(ALL)
+        for topic, key in keys.items():
+            assert topic_of(key) is topic is BY_NAME[topic.name]
+            at = topic.address_of(key)
+            assert at is not None
+            assert (at.site, at.camera) == ("test", "cam")
+
+    def test_what_a_camera_sends_is_for_every_object(self) -> None:
+        other = Address("test", "cup", "cam")
+        assert [topic.name for topic in ALL if ADDRESS.key(topic) == other.key(topic)] == ["frame", "camera_info"]
 
     @pytest.mark.parametrize("part", ["", "a/b", "a b", "**", "a*", "é"])
     def test_a_part_that_is_no_part_is_refused(self, part: str) -> None:

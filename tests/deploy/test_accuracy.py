@@ -9,7 +9,7 @@ import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
 from fieldpose.deploy.evaluation.accuracy import in_words, pose_accuracy
-from fieldpose.deploy.local import PoseFinder
+from fieldpose.deploy.local import photo_finder
 from fieldpose.deploy.settings import Settings, changed
 from fieldpose.stages.geometry import perturb
 from fieldpose.stages.nerf.metadata import PoseAccuracy
@@ -69,8 +69,8 @@ def test_few_that_are_found_are_a_reason_to_doubt() -> None:
 
 def test_a_pose_is_as_certain_as_the_field_has_shown(scene: AnalyticScene, images: list[np.ndarray]) -> None:
     views = views_at(POSES)
-    plain = PoseFinder(scene, SETTINGS, views).find(images[3], SEEN_BY, POSES[3])
-    scaled = PoseFinder(scene, SETTINGS, replace(views, error_scale=2.0)).find(images[3], SEEN_BY, POSES[3])
+    plain = photo_finder(SETTINGS, views, scene).find(images[3], SEEN_BY, POSES[3])
+    scaled = photo_finder(SETTINGS, replace(views, error_scale=2.0), scene).find(images[3], SEEN_BY, POSES[3])
     assert plain.covariance is not None
     assert scaled.covariance is not None
     np.testing.assert_array_equal(scaled.cam_from_object, plain.cam_from_object)

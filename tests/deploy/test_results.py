@@ -13,12 +13,13 @@ import pytest
 from support import bus_samples
 
 from fieldpose.bus.memory import MemoryBus
-from fieldpose.bus.messages import Header, Pose, Reason, State, TrackingState
+from fieldpose.bus.messages import Failure, Header, Pose, Reason, State, TrackingState
 from fieldpose.bus.ports import Outbox, first_header
 from fieldpose.bus.replay import RecordingInfo, SourceInfo, TopicInfo
 from fieldpose.bus.topics import (
     CORRESPONDENCES,
     ESTIMATE,
+    FAILURE,
     FRAME,
     GUESS,
     MATCHES,
@@ -29,6 +30,7 @@ from fieldpose.bus.topics import (
     VIEW,
     Address,
 )
+from fieldpose.deploy.graph import STAGES
 from fieldpose.deploy.processes.collector import Collector
 from fieldpose.deploy.reporting.results import FrameResult, RunResult, TruthKnown, accuracy, rate_hz, summarise, to_csv
 from fieldpose.stages.geometry import exp_se3
@@ -96,32 +98,34 @@ def test_the_rows_hold_pose_and_errors() -> None:
 def collected() -> Iterator[tuple[Collector, dict[str, Outbox]]]:
     bus = MemoryBus()
     collector = Collector(bus, ADDRESS)
-    yield collector, {name: Outbox(bus, ADDRESS, name) for name in ("camera", "stage", "tracking")}
+    yield collector, {name: Outbox(bus, ADDRESS, name) for name in STAGES}
     collector.close()
 
 
-def state(header: Header, pose: np.ndarray | None, score: float) -> State:
+def state(header: Header, pose: np.ndarray | None, score: float, reason: Reason | None = None) -> State:
     return State(
-        header=header, state=TrackingState.TRACKING, score=score, cam_from_object=pose, covariance=None, in_flight=0,
-        admitted=1, finished=1, dropped_at_the_door=0, lost=0,
+        header=header, state=TrackingState.TRACKING, score=score, cam_from_object=pose, covariance=None, reason=reason,
+        in_flight=0, admitted=1, finished=1, dropped_at_the_door=0, lost=0,
     )  # fmt: skip
 
 
 def pose(header: Header) -> Pose:
     return Pose(
-        header=header, ok=True, reason=Reason.OK, cam_from_object=np.eye(4), covariance=None, inliers=9,
+        header=header, cam_from_object=np.eye(4), covariance=np.eye(6), inliers=9,
         correspondences=9, residual_px=1.0, refined=False, loss_before=None, loss_after=None,
     )  # fmt: skip
 
 
 def one_pass(outboxes: dict[str, Outbox], frame_id: int, pass_index: int = 0) -> None:
     header = first_header(frame_id, 1000 + frame_id, pass_index)
-    samples = bus_samples.every_message()
-    for topic in (GUESS, VIEW, MATCHES, CORRESPONDENCES, ESTIMATE):
-        message = copy.copy(samples[topic])
+    messages = {**bus_samples.every_message(), POSE: pose(header)}
+    for name, topic in (
+        ("tracking", GUESS), ("rendering", VIEW), ("matching", MATCHES), ("lifting", CORRESPONDENCES),
+        ("pnp", ESTIMATE), ("refinement", POSE),
+    ):  # fmt: skip
+        message = copy.copy(messages[topic])
         message.header = header
-        outboxes["stage"].publish(topic, message)
-    outboxes["stage"].publish(POSE, pose(header))
+        outboxes[name].publish(topic, message)
 
 
 def test_what_goes_over_the_bus_becomes_rows(collected: tuple[Collector, dict[str, Outbox]]) -> None:
@@ -134,8 +138,8 @@ def test_what_goes_over_the_bus_becomes_rows(collected: tuple[Collector, dict[st
     outboxes["tracking"].publish(STATE, state(first_header(0, 1000, 1), np.eye(4), 0.9))
     one_pass(outboxes, 1)
     outboxes["tracking"].publish(STATE, state(first_header(1, 1001), np.eye(4), 0.0))
-    outboxes["stage"].publish(GUESS, bus_samples.guess(2))
-    outboxes["tracking"].publish(STATE, state(first_header(2, 1002), np.eye(4), 0.5))
+    outboxes["tracking"].publish(GUESS, bus_samples.guess(2))
+    outboxes["tracking"].publish(STATE, state(first_header(2, 1002), None, 0.0, Reason.NO_ANSWER))
     collector.update()
     rows = collector.results()
     assert [row.outcome for row in rows] == ["finished", "finished", "lost", "dropped"]
@@ -147,6 +151,23 @@ def test_what_goes_over_the_bus_becomes_rows(collected: tuple[Collector, dict[st
     assert total is not None
     assert sum(rows[0].stage_ms.values()) == pytest.approx(total, rel=1e-6)
     assert rows[2].latency_ms is None
+    assert (rows[2].reason, rows[0].reason) == ("no_answer", None)
+    assert rows[0].camera_origin == "calibrated"
+
+
+def test_a_failure_ends_a_pass_and_its_reason_is_told(collected: tuple[Collector, dict[str, Outbox]]) -> None:
+    collector, outboxes = collected
+    header = first_header(0, 1000)
+    outboxes["camera"].publish(FRAME, bus_samples.frame(0))
+    outboxes["tracking"].publish(GUESS, bus_samples.guess(0))
+    failure = Failure(header=header, stage="rendering", reason=Reason.NOTHING_IN_VIEW)
+    outboxes["rendering"].publish(FAILURE, failure)
+    outboxes["tracking"].publish(STATE, state(header, None, 0.0, Reason.NOTHING_IN_VIEW))
+    collector.update()
+    (row,) = collector.results()
+    assert (row.outcome, row.reason, row.cam_from_object) == ("finished", "nothing_in_view", None)
+    assert set(row.stage_ms) == {"tracking", "rendering"}
+    assert summarise(RunResult([row]))["reasons"] == {"nothing_in_view": 1}
 
 
 def test_the_documented_keys_are_there(collected: tuple[Collector, dict[str, Outbox]]) -> None:
@@ -154,7 +175,7 @@ def test_the_documented_keys_are_there(collected: tuple[Collector, dict[str, Out
     outboxes["camera"].publish(FRAME, bus_samples.frame(0))
     one_pass(outboxes, 0)
     outboxes["tracking"].publish(STATE, state(first_header(0, 1000), np.eye(4), 0.9))
-    outboxes["stage"].publish(STATS, bus_samples.every_message()[STATS])
+    outboxes["pnp"].publish(STATS, bus_samples.every_message()[STATS])
     collector.update()
     summary = summarise(RunResult(collector.results(), collector.sent, collector.stats, collector.observed, {"pnp": 2}))
     assert summary["frames"] == summary["poses_ok"] == summary["frames_sent"] == 1

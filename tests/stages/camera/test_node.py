@@ -7,13 +7,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from support.posed_images import CAMERA, write_blender
 
-from fieldpose.bus.messages import Frame, State, TrackingState
+from fieldpose.bus.messages import (
+    CameraInfo,
+    CameraOrigin,
+    Failure,
+    Frame,
+    Message,
+    Reason,
+    State,
+    TrackingState,
+    Truth,
+)
 from fieldpose.bus.node import EndOfInput, first_header
-from fieldpose.bus.topics import STATE
+from fieldpose.bus.topics import CAMERA_INFO, FAILURE, FRAME, STATE, TRUTH
 from fieldpose.errors import SourceError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.node import CameraNode
+from fieldpose.stages.geometry import Camera
 
 
 @pytest.fixture
@@ -31,16 +43,22 @@ def started(folder: Path, **config: object) -> CameraNode:
     return node
 
 
-def sent(node: CameraNode, now_ns: int = 10**18) -> list[Frame]:
-    """What a tick sends until the node ends."""
-    frames = []
+def all_sent(node: CameraNode, now_ns: int = 10**18) -> list[Message]:
+    """What a tick sends until the node ends; each on its own topic."""
+    messages = []
     try:
-        for _, message in node.tick(now_ns):
-            assert isinstance(message, Frame)
-            frames.append(message)
+        for topic, message in node.tick(now_ns):
+            assert topic in node.outputs
+            assert isinstance(message, topic.message_type)
+            messages.append(message)
     except EndOfInput:
         pass
-    return frames
+    return messages
+
+
+def sent(node: CameraNode, now_ns: int = 10**18) -> list[Frame]:
+    """The frames among them."""
+    return [message for message in all_sent(node, now_ns) if isinstance(message, Frame)]
 
 
 def answer(frame_id: int) -> State:
@@ -63,8 +81,9 @@ def test_an_answer_brings_the_next_frame_at_once_and_the_last_one_the_end(folder
     assert [frame.header.frame_id for frame in sent(node)] == [0]
     assert sent(node) == []
     for i in (1, 2):
-        messages = [message for _, message in node.handle(STATE, answer(i - 1))]
-        assert [message.header.frame_id for message in messages] == [i]
+        said = list(node.handle(STATE, answer(i - 1)))
+        assert [topic for topic, _ in said] == [FRAME, CAMERA_INFO]
+        assert [message.header.frame_id for _, message in said] == [i, i]
     with pytest.raises(EndOfInput):
         list(node.handle(STATE, answer(2)))
     node.stop()
@@ -75,6 +94,74 @@ def test_frames_carry_image_camera_and_the_time_of_capture(folder: Path) -> None
     np.testing.assert_array_equal(frame.image, np.zeros((8, 12, 3)))
     assert (frame.camera.width, frame.camera.height, frame.camera.cx) == (12, 8, 5.5)
     assert frame.header.capture_ns == 123_456
+
+
+def test_after_a_frame_comes_what_it_is_without_its_pixels(folder: Path) -> None:
+    frame, info = all_sent(started(folder), now_ns=123_456)
+    assert isinstance(frame, Frame)
+    assert isinstance(info, CameraInfo)
+    assert (info.header, info.camera, info.camera_origin) == (frame.header, frame.camera, frame.camera_origin)
+
+
+def test_a_known_truth_comes_before_its_frame(tmp_path: Path) -> None:
+    poses = write_blender(tmp_path, CAMERA.resized(16, 16), counts=(2, 2))
+    node = CameraNode(CameraConfig(f"dataset:{tmp_path}:test", pace="fast"))
+    node.start()
+    messages = all_sent(node)
+    assert [type(message) for message in messages] == [Truth, Frame, CameraInfo] * 2
+    assert [message.header.frame_id for message in messages] == [0, 0, 0, 1, 1, 1]
+    for truth, pose in zip(messages[::3], poses[2:], strict=True):
+        assert isinstance(truth, Truth)
+        np.testing.assert_allclose(truth.cam_from_object, pose, atol=1e-6)
+    assert TRUTH in node.outputs
+
+
+@pytest.mark.parametrize(
+    ("known", "origin", "focal"),
+    [
+        ([Camera(24, 16, 30.0, 30.0, 11.5, 7.5)], CameraOrigin.TRAINING, 15.0),
+        ([Camera(16, 16, 30.0, 30.0, 7.5, 7.5)], CameraOrigin.ASSUMED, 6 / np.tan(np.pi / 6)),
+        ([], CameraOrigin.ASSUMED, 6 / np.tan(np.pi / 6)),
+    ],
+    ids=["known", "another shape", "unknown"],
+)
+def test_frames_and_what_is_told_of_them_tell_where_their_camera_is_from(
+    folder: Path, known: list[Camera], origin: CameraOrigin, focal: float
+) -> None:
+    node = CameraNode(CameraConfig(f"folder:{folder}", pace="fast"), lambda: known)
+    node.start()
+    messages = all_sent(node)
+    assert len(messages) == 6
+    for message in messages:
+        assert isinstance(message, Frame | CameraInfo)
+        assert message.camera_origin is origin
+        assert message.camera.fx == pytest.approx(focal)
+
+
+def test_the_training_cameras_are_not_asked_for_before_the_start(folder: Path) -> None:
+    calls: list[str] = []
+
+    def known() -> list[Camera]:
+        calls.append("asked")
+        return []
+
+    node = CameraNode(CameraConfig(f"folder:{folder}"), known, lambda: calls.append("waited"))
+    assert calls == []
+    node.start()
+    assert calls == ["asked", "waited"]
+    node.stop()
+
+
+def test_a_failure_is_a_sign_of_life_but_no_answer(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    second = 1_000_000_000
+    node = started(folder, answer_timeout_s=1.0)
+    assert FAILURE in node.inputs
+    assert [frame.header.frame_id for frame in sent(node, now_ns=0)] == [0]
+    failure = Failure(header=first_header(0, 0), stage="pnp", reason=Reason.NO_CONSENSUS)
+    monkeypatch.setattr("fieldpose.stages.camera.node.time.time_ns", lambda: second // 2)
+    assert list(node.handle(FAILURE, failure)) == []
+    assert sent(node, now_ns=second + second // 4) == []
+    assert [frame.header.frame_id for frame in sent(node, now_ns=2 * second)] == [1]
 
 
 def test_a_camera_that_died_goes_on_with_the_next_frame(folder: Path, tmp_path: Path) -> None:
@@ -94,7 +181,7 @@ def test_a_source_that_breaks_on_the_way_ends_the_process_with_its_error(folder:
 
 def test_nothing_is_sent_before_the_others_are_ready(folder: Path) -> None:
     calls = []
-    node = CameraNode(CameraConfig(f"folder:{folder}"), lambda: calls.append("waited"))
+    node = CameraNode(CameraConfig(f"folder:{folder}"), wait_until_ready=lambda: calls.append("waited"))
     assert calls == []
     node.start()
     assert calls == ["waited"]

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from support.posed_images import CAMERA, write_blender, write_transforms
 
-from fieldpose.bus.messages import Camera, Frame, Truth
+from fieldpose.bus.messages import CameraOrigin, Frame, Truth
 from fieldpose.bus.node import first_header
 from fieldpose.bus.recorder import RecordingWriter
 from fieldpose.bus.topics import FRAME, TRUTH, Address
@@ -119,8 +119,11 @@ def camera_file(path: Path, **changes: object) -> Path:
 
 
 def test_a_camera_file_overrides_and_is_scaled_to_the_images(folder: Path, tmp_path: Path) -> None:
-    frame = frames_of(f"folder:{folder}", camera_file=camera_file(tmp_path / "camera.json"))[0]
-    assert frame.camera == Camera(48, 32, 50.0, 50.5, 23.5, 15.5, (0.1, 0, 0, 0, 0))
+    config = CameraConfig(f"folder:{folder}", camera_file=camera_file(tmp_path / "camera.json"))
+    for known in ([], [Camera(96, 64, 80.0, 81.0, 47.0, 32.0)]):
+        frame = next(open_source(config, known).frames(0))
+        assert frame.camera == Camera(48, 32, 50.0, 50.5, 23.5, 15.5, (0.1, 0, 0, 0, 0))
+        assert frame.origin is CameraOrigin.CALIBRATED
 
 
 @pytest.mark.parametrize(
@@ -141,6 +144,36 @@ def test_a_bad_camera_file_is_named(folder: Path, tmp_path: Path, changes: dict,
     assert "\n" not in str(caught.value)
     with pytest.raises(SourceError, match="no such camera file"):
         frames_of(f"folder:{folder}", camera_file=tmp_path / "none.json")
+
+
+def test_every_image_of_a_folder_tells_where_its_own_camera_is_from(tmp_path: Path) -> None:
+    Image.fromarray(shade(5)).save(tmp_path / "0.jpg")
+    with_exif(tmp_path / "1.jpg", 0xA405, 60, ifd=0x8769)
+    Image.fromarray(shade(5)).save(tmp_path / "2.png")
+    Image.fromarray(shade(5, 32, 32)).save(tmp_path / "3.png")
+    known = [Camera(96, 64, 80.0, 81.0, 47.0, 32.0)]
+    source = open_source(CameraConfig(f"folder:{tmp_path}"), known)
+    assert "training views" in source.description
+    frames = list(source.frames(0))
+    training, exif, assumed = CameraOrigin.TRAINING, CameraOrigin.EXIF, CameraOrigin.ASSUMED
+    assert [frame.origin for frame in frames] == [training, exif, training, assumed]
+    assert [frame.encoding for frame in frames] == ["jpeg", "jpeg", "rgb8", "rgb8"]
+    assert frames[0].camera == frames[2].camera == known[0].resized(48, 32)
+    assert frames[1].camera.fx == pytest.approx(80.0)
+
+
+def test_a_training_camera_is_shrunk_with_the_image(folder: Path) -> None:
+    known = [Camera(96, 64, 80.0, 81.0, 47.0, 32.0)]
+    frame = next(open_source(CameraConfig(f"folder:{folder}", size=24), known).frames(0))
+    assert frame.origin is CameraOrigin.TRAINING
+    assert frame.camera == known[0].resized(24, 16)
+
+
+def test_a_dataset_knows_its_cameras_and_is_told_none(tmp_path: Path) -> None:
+    write_transforms(tmp_path, CAMERA, count=9)
+    known = [Camera(96, 64, 80.0, 81.0, 47.0, 32.0)]
+    frame = next(open_source(CameraConfig(f"dataset:{tmp_path}:test"), known).frames(0))
+    assert (frame.camera.fx, frame.origin) == (CAMERA.fx, CameraOrigin.CALIBRATED)
 
 
 def test_a_dataset_split_comes_with_its_true_poses(tmp_path: Path) -> None:
@@ -198,7 +231,26 @@ def test_a_device_is_read_with_the_time_of_day(video: Path) -> None:
     assert frames[0].at_ns > 1.6e18
 
 
-def record(path: Path, order: list[tuple[str, int]], camera: str = "camera0", encoding: str = "rgb8") -> Path:
+@pytest.mark.parametrize("kind", ["video", "camera"])
+def test_videos_and_devices_take_the_training_camera_of_their_shape(video: Path, kind: str) -> None:
+    for camera, origin in (
+        (Camera(96, 64, 80.0, 81.0, 47.0, 32.0), CameraOrigin.TRAINING),
+        (Camera(64, 96, 80.0, 81.0, 32.0, 47.0), CameraOrigin.ASSUMED),
+    ):
+        source = open_source(CameraConfig(f"{kind}:{video}", size=24), [camera])
+        frame = next(source.frames(0))
+        assert frame.origin is origin
+        if origin is CameraOrigin.TRAINING:
+            assert frame.camera == camera.resized(24, 16)
+            assert "training views" in source.description
+        else:
+            assert "60 degrees" in source.description
+
+
+def record(
+    path: Path, order: list[tuple[str, int]], camera: str = "camera0", encoding: str = "rgb8",
+    origin: CameraOrigin = CameraOrigin.CALIBRATED,
+) -> Path:  # fmt: skip
     writer = RecordingWriter(path)
     address = Address(camera=camera)
     for i, (kind, frame_id) in enumerate(order):
@@ -211,7 +263,7 @@ def record(path: Path, order: list[tuple[str, int]], camera: str = "camera0", en
         if encoding == "jpeg":
             image = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
         model = Camera(48, 32, 50.0, 50.0, 23.5, 15.5)
-        frame = Frame(header=header, image=image, encoding=encoding, camera=model)  # type: ignore[arg-type]
+        frame = Frame(header=header, image=image, encoding=encoding, camera=model, camera_origin=origin)  # type: ignore[arg-type]
         writer.write(address.key(FRAME), FRAME, frame, i)
     writer.close()
     return path
@@ -236,6 +288,15 @@ def test_recorded_images_stay_encoded_unless_they_are_shrunk(tmp_path: Path) -> 
     small = frames_of(f"mcap:{path}", size=24)[0]
     assert (small.encoding, small.image.shape, small.camera.fx) == ("rgb8", (16, 24, 3), 25.0)
     assert small.image[..., 0].mean() == pytest.approx(60, abs=4)
+
+
+@pytest.mark.parametrize("size", [None, 24])
+@pytest.mark.parametrize("origin", list(CameraOrigin))
+def test_a_recording_remembers_where_its_camera_is_from(tmp_path: Path, origin: CameraOrigin, size: int | None) -> None:
+    path = record(tmp_path / "a.mcap", [("frame", 0)], origin=origin)
+    known = [Camera(96, 64, 80.0, 81.0, 47.0, 32.0)]
+    frame = next(open_source(CameraConfig(f"mcap:{path}", size=size), known).frames(0))
+    assert (frame.origin, frame.camera.fx) == (origin, 50.0 if size is None else 25.0)
 
 
 def test_a_recording_of_two_cameras_is_not_mixed(tmp_path: Path) -> None:

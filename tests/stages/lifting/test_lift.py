@@ -10,7 +10,7 @@ from fieldpose.stages.nerf.rendering_api import RenderedRays, RenderedView
 
 CAMERA = camera(120)
 POSE = viewpoint()
-CONFIG = LiftingConfig()
+CONFIG = LiftingConfig(min_kept=0)
 
 
 class Plane:

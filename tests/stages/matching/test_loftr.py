@@ -8,6 +8,7 @@ import torch
 from kornia.feature import LoFTR
 from support.pictures import picture
 
+from fieldpose.bus.messages import Reason
 from fieldpose.errors import WeightsError
 from fieldpose.stages.matching.core import Matcher, MatchingConfig, PairMatcher, build_matcher
 
@@ -51,7 +52,7 @@ def test_masks_and_sizes_are_respected(matcher: Matcher) -> None:
 def test_random_weights_are_not_confident(folder: Path) -> None:
     config = MatchingConfig(matcher="loftr", weights=folder / "loftr_outdoor.ckpt")
     matched = PairMatcher(build_matcher(config), config).match(picture(0, 96), np.ones((96, 96)), picture(1, 96))
-    assert len(matched.confidence) == 0
+    assert matched is Reason.TOO_FEW_MATCHES
 
 
 def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:

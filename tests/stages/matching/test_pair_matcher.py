@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from support.pictures import WarpedPair, needs, picture, warped
 
+from fieldpose.bus.messages import Reason
 from fieldpose.stages.matching.core import (
     Features,
     MatchedPixels,
@@ -112,12 +113,14 @@ def test_no_view_is_kept_where_there_is_room_for_none() -> None:
 def test_a_large_frame_is_matched_at_the_views_size_and_answered_in_its_own_pixels() -> None:
     matcher = Corners()
     frame = np.zeros((480, 640, 3), np.uint8)
-    matched = PairMatcher(matcher, MatchingConfig()).match(picture(0, 160), np.ones((160, 160)), frame)
+    matched = PairMatcher(matcher, MatchingConfig(min_matches=0)).match(picture(0, 160), np.ones((160, 160)), frame)
+    assert not isinstance(matched, Reason)
     assert matcher.extracted[1][0] == (120, 160, 3)
     np.testing.assert_allclose(matched.pixels_b.mean(axis=0), (319.5, 239.5))
     np.testing.assert_allclose(matched.pixels_b[1, 0] - matched.pixels_b[0, 0], 80)
     np.testing.assert_allclose(matched.pixels_a[1, 0] - matched.pixels_a[0, 0], 20)
-    PairMatcher(matcher, MatchingConfig(frame_size=320)).match(picture(0, 160), np.ones((160, 160)), frame)
+    larger = MatchingConfig(frame_size=320, min_matches=0)
+    PairMatcher(matcher, larger).match(picture(0, 160), np.ones((160, 160)), frame)
     assert matcher.extracted[3][0] == (240, 320, 3)
 
 

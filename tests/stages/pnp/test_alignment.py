@@ -1,12 +1,13 @@
 """Looking for lifted points in the frame, on a scene whose geometry is known exactly."""
 
-from dataclasses import replace
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
+from fieldpose.bus.messages import Reason
 from fieldpose.errors import GeometryError
 from fieldpose.stages.geometry import Camera, exp_se3, perturb, rays, rotation_error_deg, translation_error
 from fieldpose.stages.nerf.rendering_api import RenderedView
@@ -64,9 +65,13 @@ def matched(points: np.ndarray, wrong: float, noise_px: float, seed: int = 0) ->
     return pixels.astype(np.float32)
 
 
-def pose_of(result: PnpResult) -> np.ndarray:
-    assert result.cam_from_object is not None
-    return result.cam_from_object
+def solved(result: PnpResult | Reason) -> PnpResult:
+    assert isinstance(result, PnpResult)
+    return result
+
+
+def pose_of(result: PnpResult | Reason) -> np.ndarray:
+    return solved(result).cam_from_object
 
 
 def test_points_are_found_where_they_are(
@@ -94,8 +99,8 @@ def test_the_pose_is_better_by_pictures_than_by_matches(
     view: RenderedView, frame: np.ndarray, points: np.ndarray
 ) -> None:
     pixels = matched(points, 0.6, 1.5)
-    plain = solve(pixels, points, LENS)
-    better = solve(pixels, points, LENS, pictures=pictures(view, frame))
+    plain = solved(solve(pixels, points, LENS))
+    better = solved(solve(pixels, points, LENS, pictures=pictures(view, frame)))
     assert rotation_error_deg(pose_of(better), TRUTH) < 0.4 * rotation_error_deg(pose_of(plain), TRUTH)
     assert translation_error(pose_of(better), TRUTH) < 0.4 * translation_error(pose_of(plain), TRUTH)
     assert better.inliers.sum() > plain.inliers.sum()
@@ -109,7 +114,7 @@ def test_a_wrong_pose_is_told_by_how_little_is_found(
     """Matches that agree on a pose from which the frame was not taken."""
     elsewhere = photograph(scene, LENS, viewpoint(200.0, 15.0))
     pixels = matched(points, 0.0, 1.0)
-    agreed = solve(pixels, points, LENS, PnpConfig(align_levels=0), pictures=pictures(view, elsewhere))
+    agreed = solved(solve(pixels, points, LENS, PnpConfig(align_levels=0), pictures=pictures(view, elsewhere)))
     assert agreed.inliers.mean() > 0.8
     placed = Aligner(pictures(view, elsewhere), points, LENS, PnpConfig()).place(pose_of(agreed), 0)
     assert len(placed.index) < PnpConfig().min_support * len(points)
@@ -120,11 +125,11 @@ def test_few_matches_give_a_pose_only_if_points_are_found_where_it_puts_them(
 ) -> None:
     """One in seventeen matches is right, which is too few to believe without seeing."""
     pixels, config = matched(points, 0.94, 0.4, seed=3), PnpConfig(least_iterations=50_000, iterations=50_000)
-    assert not solve(pixels, points, LENS, config).ok
-    seen = solve(pixels, points, LENS, config, pictures=pictures(view, frame))
+    assert isinstance(solve(pixels, points, LENS, config), Reason)
+    seen = solved(solve(pixels, points, LENS, config, pictures=pictures(view, frame)))
     assert rotation_error_deg(pose_of(seen), TRUTH) < 0.3
     elsewhere = photograph(scene, LENS, viewpoint(200.0, 15.0))
-    assert not solve(pixels, points, LENS, config, pictures=pictures(view, elsewhere)).ok
+    assert isinstance(solve(pixels, points, LENS, config, pictures=pictures(view, elsewhere)), Reason)
 
 
 @pytest.mark.parametrize("size", [(1, 200), (200, 1), (1, 1)])
@@ -152,8 +157,8 @@ def test_landmarks_hold_a_pose_that_is_matched_in_one_place_only(
 ) -> None:
     close = np.argsort(np.linalg.norm(points - points[seed], axis=1))[:25]
     pixels = matched(points, 0.0, 0.5, seed)[close]
-    without = solve(pixels, points[close], LENS, PnpConfig(landmarks=0), pictures=pictures(view, frame))
-    result = solve(pixels, points[close], LENS, pictures=pictures(view, frame))
+    without = solved(solve(pixels, points[close], LENS, PnpConfig(landmarks=0), pictures=pictures(view, frame)))
+    result = solved(solve(pixels, points[close], LENS, pictures=pictures(view, frame)))
     assert translation_error(pose_of(result), TRUTH) < 0.6 * translation_error(pose_of(without), TRUTH)
     assert result.inliers.shape == (25,)
     assert len(without.inliers_in_frame) <= without.correspondences == 25
@@ -173,7 +178,7 @@ def test_parts_that_look_alike_are_told_apart_by_landmarks(
     pixels = np.random.default_rng(1).uniform(0, 259, here.shape).astype(np.float32)
     pixels[top], pixels[right] = there[top], here[right]
     given = pictures(view, doubled)
-    hasty = solve(pixels, points, LENS, PnpConfig(sure_landmarks=0.0), pictures=given)
+    hasty = solved(solve(pixels, points, LENS, PnpConfig(sure_landmarks=0.0), pictures=given))
     assert rotation_error_deg(pose_of(hasty), wrong) < 1
     assert translation_error(pose_of(hasty), wrong) < 0.05
     assert translation_error(pose_of(solve(pixels, points, LENS, pictures=given)), TRUTH) < 0.01
@@ -191,7 +196,7 @@ def test_no_pose_is_borne_out_where_too_few_landmarks_are_found(
     pixels[top] = here[top]
     given, many = pictures(view, covered), PnpConfig(min_landmarks=0.6)
     assert translation_error(pose_of(solve(pixels, points, LENS, pictures=given)), TRUTH) < 0.01
-    assert not solve(pixels, points, LENS, many, pictures=given).ok
+    assert isinstance(solve(pixels, points, LENS, many, pictures=given), Reason)
 
 
 @pytest.mark.parametrize("frame_shade", [0, 255])
@@ -199,7 +204,8 @@ def test_a_frame_without_anything_leaves_the_pose_of_the_matches(
     view: RenderedView, points: np.ndarray, frame_shade: int
 ) -> None:
     blank, pixels = np.full((260, 260, 3), frame_shade, np.uint8), matched(points, 0.3, 1.0)
-    plain, looked = solve(pixels, points, LENS), solve(pixels, points, LENS, pictures=pictures(view, blank))
+    plain = solved(solve(pixels, points, LENS))
+    looked = solved(solve(pixels, points, LENS, pictures=pictures(view, blank)))
     assert np.array_equal(pose_of(looked), pose_of(plain))
     assert np.array_equal(looked.inliers, plain.inliers)
 
@@ -207,10 +213,10 @@ def test_a_frame_without_anything_leaves_the_pose_of_the_matches(
 def test_few_matches_that_no_search_bears_out_are_not_believed(view: RenderedView, points: np.ndarray) -> None:
     """A fifth of the matches agrees, which is enough by itself, but nothing of the view is seen in the frame."""
     blank, pixels = np.full((260, 260, 3), 128, np.uint8), matched(points, 0.8, 0.5)
-    assert solve(pixels, points, LENS).ok
+    solved(solve(pixels, points, LENS))
     given = pictures(view, blank)
-    assert solve(pixels, points, LENS, pictures=given).reason == "no_consensus"
-    assert solve(pixels, points, LENS, PnpConfig(min_unaligned=0.1), pictures=given).ok
+    assert solve(pixels, points, LENS, pictures=given) is Reason.NO_CONSENSUS
+    solved(solve(pixels, points, LENS, PnpConfig(min_unaligned=0.1), pictures=given))
 
 
 @pytest.mark.parametrize(("radius_px", "believed"), [(0.9, True), (2.2, False)])
@@ -225,8 +231,8 @@ def test_points_that_lie_anywhere_where_they_were_looked_for_were_found_by_chanc
     placed = Placed(np.arange(count), scattered, np.tile(np.eye(2), (count, 1, 1)), np.ones(count, bool))
     monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: placed)
     pixels = matched(points, 0.3, 0.5)
-    plain = solve(pixels, points, LENS)
-    looked = solve(pixels, points, LENS, PnpConfig(landmarks=0), pictures=pictures(view, frame))
+    plain = solved(solve(pixels, points, LENS))
+    looked = solved(solve(pixels, points, LENS, PnpConfig(landmarks=0), pictures=pictures(view, frame)))
     assert np.array_equal(pose_of(looked), pose_of(plain)) is not believed
 
 
@@ -236,7 +242,7 @@ def test_a_blurred_frame_is_better_known_by_its_matches(
     """Patches are hardly found in it; the pose must not come to rest on the few that are."""
     shaken, pixels = cv2.GaussianBlur(frame, (0, 0), 9.0), matched(points, 0.2, 0.7)
     pixels[200:] += np.array([3.5, 2.5], np.float32)  # near misses agree among themselves too
-    result = solve(pixels, points, LENS, pictures=pictures(view, shaken))
+    result = solved(solve(pixels, points, LENS, pictures=pictures(view, shaken)))
     assert result.inliers.sum() > 120
     assert rotation_error_deg(pose_of(result), TRUTH) < 0.5
 
@@ -254,8 +260,8 @@ def test_landmarks_outside_the_frame_are_not_missed(view: RenderedView, frame: n
     """The frame is the left part of the camera's image."""
     here = in_frame(points)
     left = here[:, 0] < 118
-    narrow = replace(LENS, width=120)
-    cut = solve(here[left].astype(np.float32), points[left], narrow, pictures=pictures(view, frame[:, :120]))
+    narrow = msgspec.structs.replace(LENS, width=120)
+    cut = solved(solve(here[left].astype(np.float32), points[left], narrow, pictures=pictures(view, frame[:, :120])))
     assert translation_error(pose_of(cut), TRUTH) < 0.01
     assert len(points[left]) + 33 <= cut.correspondences < len(points[left]) + 70
 
@@ -265,8 +271,7 @@ def test_a_pose_that_landmarks_do_not_bear_out_says_how_many_points_were_looked_
 ) -> None:
     """So that it does not pass for one that all points agree on."""
     elsewhere = photograph(scene, LENS, viewpoint(200.0, 15.0))
-    believed = solve(matched(points, 0.0, 1.0), points, LENS, pictures=pictures(view, elsewhere))
-    assert believed.ok
+    believed = solved(solve(matched(points, 0.0, 1.0), points, LENS, pictures=pictures(view, elsewhere)))
     assert believed.correspondences == len(points) + 100
 
 
@@ -274,15 +279,15 @@ def test_points_found_where_the_lens_has_no_inverse_leave_the_pose_of_the_matche
     view: RenderedView, frame: np.ndarray, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """k1 = -1.2 folds the image over itself 123 pixels from its middle."""
-    folding = replace(LENS, distortion=(-1.2, 0.0, 0.0, 0.0, 0.0))
+    folding = msgspec.structs.replace(LENS, distortion=(-1.2, 0.0, 0.0, 0.0, 0.0))
     inner = np.linalg.norm(in_frame(points) - 129.5, axis=1) < 60
     pixels = in_frame(points[inner], folding).astype(np.float32)
     corner = Placed(np.arange(20), np.tile([[5.0, 5.0]], (20, 1)), np.tile(np.eye(2), (20, 1, 1)), np.ones(20, bool))
     monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: corner)
     with pytest.raises(GeometryError):
         folding.directions(corner.pixels)
-    plain = solve(pixels, points[inner], folding)
-    looked = solve(pixels, points[inner], folding, pictures=pictures(view, frame))
+    plain = solved(solve(pixels, points[inner], folding))
+    looked = solved(solve(pixels, points[inner], folding, pictures=pictures(view, frame)))
     assert np.array_equal(pose_of(looked), pose_of(plain))
 
 
@@ -290,14 +295,15 @@ def test_a_point_that_is_found_or_matched_where_the_lens_has_no_inverse_is_no_in
     view: RenderedView, frame: np.ndarray, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The others hold the pose."""
-    folding = replace(LENS, distortion=(-1.2, 0.0, 0.0, 0.0, 0.0))
+    folding = msgspec.structs.replace(LENS, distortion=(-1.2, 0.0, 0.0, 0.0, 0.0))
     inner = np.linalg.norm(in_frame(points) - 129.5, axis=1) < 60
     pixels, count = in_frame(points[inner], folding), int(inner.sum())
     pixels[:5] = 5.0
     placed = Placed(np.arange(count), pixels, np.tile(np.eye(2), (count, 1, 1)), np.ones(count, bool))
     monkeypatch.setattr(Aligner, "place", lambda self, pose, level, most=None: placed)
     for given in (None, pictures(view, frame)):
-        result = solve(pixels.astype(np.float32), points[inner], folding, PnpConfig(landmarks=0), pictures=given)
+        config = PnpConfig(landmarks=0)
+        result = solved(solve(pixels.astype(np.float32), points[inner], folding, config, pictures=given))
         assert translation_error(pose_of(result), TRUTH) < 1e-3
         assert not result.inliers[:5].any()
         assert result.inliers[5:].all()

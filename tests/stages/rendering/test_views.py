@@ -1,9 +1,11 @@
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
+from fieldpose.bus.messages import Reason
 from fieldpose.stages.geometry import Camera, exp_se3
 from fieldpose.stages.nerf.rendering_api import RenderedView
 from fieldpose.stages.rendering.core import RenderingConfig, ViewSource, view_camera
@@ -90,14 +92,15 @@ def test_the_nearest_of_several_views_is_taken(scene: Counting) -> None:
 def test_another_camera_gets_a_view_of_its_own(scene: Counting) -> None:
     source = ViewSource(scene, CONFIG)
     source.view(CAMERA, POSE)
-    assert not source.view(replace(CAMERA, fx=CAMERA.fx * 1.01), POSE).reused
+    assert not source.view(msgspec.structs.replace(CAMERA, fx=CAMERA.fx * 1.01), POSE).reused
 
 
-def test_zero_turns_the_cache_off_and_ids_stay_the_same(scene: Counting) -> None:
+def test_zero_uses_a_view_again_at_the_very_same_pose_alone(scene: Counting) -> None:
     source = ViewSource(scene, replace(CONFIG, reuse_angle_deg=0.0), "field")
-    first, second = source.view(CAMERA, POSE), source.view(CAMERA, POSE)
+    first, near, again = source.view(CAMERA, POSE), source.view(CAMERA, around(0.01)), source.view(CAMERA, POSE)
     assert scene.rendered == 2
-    assert first.view_id == second.view_id
+    assert [view.reused for view in (first, near, again)] == [False, False, True]
+    assert first.view_id == again.view_id != near.view_id
     assert ViewSource(scene, CONFIG, "other field").view(CAMERA, POSE).view_id != first.view_id
 
 
@@ -113,8 +116,10 @@ def test_the_cache_forgets_the_longest_unused_views_within_its_bytes(scene: Coun
 
 def test_a_view_of_nothing_says_so_and_is_never_near_another(scene: Counting) -> None:
     source, away = ViewSource(scene, CONFIG), np.diag([1.0, -1.0, -1.0, 1.0]) @ POSE
-    assert source.view(CAMERA, away).visible == 0
+    assert source.view(CAMERA, away) is Reason.NOTHING_IN_VIEW
     beside = away.copy()
     beside[0, 3] += 1e-3
-    assert not source.view(CAMERA, beside).reused
-    assert source.view(CAMERA, away).reused
+    assert source.view(CAMERA, beside) is Reason.NOTHING_IN_VIEW
+    assert scene.rendered == 2
+    assert source.view(CAMERA, away) is Reason.NOTHING_IN_VIEW
+    assert scene.rendered == 2

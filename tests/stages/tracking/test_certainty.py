@@ -1,4 +1,4 @@
-"""Covariances of believed poses by what a field has shown on its training images."""
+"""How certain believed poses are: by what a field has shown on its training images, and by the camera."""
 
 from __future__ import annotations
 
@@ -8,18 +8,20 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.tracking_world import ring_of_views
+from support.tracking_world import frame_info, on_sphere, ring_of_views
 
-from fieldpose.bus.messages import GuessReason
+from fieldpose.bus.messages import CameraOrigin, Reason, TrackingState
 from fieldpose.stages.geometry import exp_se3
-from fieldpose.stages.tracking.certainty import Certainty
+from fieldpose.stages.tracking.certainty import Certainty, with_camera
 from fieldpose.stages.tracking.config import TrackingConfig
-from fieldpose.stages.tracking.frame_policies import EachFramePolicy
-from fieldpose.stages.tracking.policy import Attempt, FrameInfo, Policy, PoseGuess, PoseResult
-from fieldpose.stages.tracking.track_policy import TrackPolicy
+from fieldpose.stages.tracking.photos import PhotoPolicy
+from fieldpose.stages.tracking.policy import Attempt, Belief, Policy, PoseGuess, PoseResult
+from fieldpose.stages.tracking.priors import Priors
+from fieldpose.stages.tracking.video import VideoPolicy
 
 COVARIANCE = np.diag([1e-4] * 3 + [1e-5] * 3)
 SCALE = 2.0
+SURE = Belief(TrackingState.TRACKING, 0.9, on_sphere(20, 30), COVARIANCE)
 
 
 def turned(degrees: float) -> np.ndarray:
@@ -47,17 +49,67 @@ def test_elsewhere_the_field_makes_no_difference() -> None:
     assert certainty.of(None, np.eye(4), np.eye(4)) is None
 
 
-@pytest.mark.parametrize("following", [False, True])
-def test_policies_state_it(following: bool) -> None:
+@pytest.mark.parametrize("kind", [PhotoPolicy, VideoPolicy])
+def test_policies_state_it(kind: type[PhotoPolicy] | type[VideoPolicy]) -> None:
     views = replace(ring_of_views(), error_scale=0.5)
-    pose, config = views.cam_from_object[5], TrackingConfig()
-    policy: Policy = TrackPolicy(config, views, pose) if following else EachFramePolicy(config, views, {0: pose})
-    frame = FrameInfo(0, 0)
-    guess = policy.first_guess(frame)
-    assert guess is not None
-    attempt = Attempt(frame, PoseGuess(GuessReason.PRIOR, guess.cam_from_object, guess.epoch), 0)
-    result = PoseResult(0, 0, True, pose, COVARIANCE, 150, 200, 1.0)
-    assert policy.next_guess(attempt, result) is None
+    pose, frame = views.cam_from_object[5], frame_info()
+    policy: Policy = kind(TrackingConfig(), views, Priors(), pose)
+    guess = policy.first_step(frame)
+    assert isinstance(guess, PoseGuess)
+    attempt = Attempt(frame, 0).again(guess, 0)
+    result = PoseResult(0, 0, pose, COVARIANCE, 150, 200, 1.0)
+    assert policy.next_step(attempt, result) is None
     belief = policy.conclude(attempt, result)
     assert belief.covariance is not None
     np.testing.assert_allclose(belief.covariance, COVARIANCE / 4)
+
+
+def added(origin: CameraOrigin, belief: Belief = SURE) -> np.ndarray:
+    """What a camera of that origin adds to the covariance."""
+    covariance = with_camera(belief, frame_info(origin=origin)).covariance
+    assert covariance is not None
+    assert belief.covariance is not None
+    return covariance - belief.covariance
+
+
+@pytest.mark.parametrize("origin", [CameraOrigin.CALIBRATED, CameraOrigin.TRAINING])
+def test_a_known_camera_takes_nothing_from_a_belief(origin: CameraOrigin) -> None:
+    assert with_camera(SURE, frame_info(origin=origin)) is SURE
+
+
+def test_an_assumed_camera_limits_a_belief() -> None:
+    belief = with_camera(SURE, frame_info(origin=CameraOrigin.ASSUMED))
+    assert (belief.state, belief.score) == (TrackingState.LIMITED, 0.3)
+    assert belief.cam_from_object is SURE.cam_from_object
+    assert (np.linalg.eigvalsh(added(CameraOrigin.ASSUMED)) > 0).all()
+    weak = with_camera(replace(SURE, score=0.21), frame_info(origin=CameraOrigin.ASSUMED))
+    assert weak.score == 0.21
+
+
+def test_a_camera_from_exif_is_less_certain_than_a_known_one_and_more_than_an_assumed_one() -> None:
+    belief = with_camera(SURE, frame_info(origin=CameraOrigin.EXIF))
+    assert (belief.state, belief.score) == (SURE.state, SURE.score)
+    exif, assumed = added(CameraOrigin.EXIF), added(CameraOrigin.ASSUMED)
+    assert (np.linalg.eigvalsh(exif) > 0).all()
+    assert (np.linalg.eigvalsh(assumed - exif) > 0).all()
+
+
+@given(st.floats(0.1, 100.0), st.sampled_from([CameraOrigin.EXIF, CameraOrigin.ASSUMED]))
+def test_the_position_is_the_less_certain_the_farther_the_camera_is(distance: float, origin: CameraOrigin) -> None:
+    near, far = (added(origin, replace(SURE, cam_from_object=on_sphere(20, 30, d))) for d in (distance, 2 * distance))
+    assert np.trace(far[:3, :3]) == pytest.approx(4 * np.trace(near[:3, :3]))
+    np.testing.assert_allclose(far[3:, 3:], near[3:, 3:], atol=1e-12)
+
+
+@pytest.mark.parametrize("origin", list(CameraOrigin))
+@pytest.mark.parametrize(
+    "belief",
+    [
+        Belief(TrackingState.LOST, 0.0, reason=Reason.NO_CONSENSUS),
+        Belief(TrackingState.INITIALIZING, 0.0, reason=Reason.NO_ANSWER),
+        Belief(TrackingState.LIMITED, 0.0, on_sphere(0, 0), reason=Reason.NO_ANSWER),
+    ],
+    ids=["lost", "initializing", "carried on"],
+)
+def test_no_camera_makes_more_of_a_belief_without_a_measurement(belief: Belief, origin: CameraOrigin) -> None:
+    assert with_camera(belief, frame_info(origin=origin)) == belief

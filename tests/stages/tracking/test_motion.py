@@ -45,9 +45,7 @@ def test_the_order_of_arrival_does_not_matter(order: list[int]) -> None:
     np.testing.assert_array_equal(shuffled.predict(SECOND // 4), sorted_.predict(SECOND // 4))
 
 
-def two_poses(
-    config: MotionConfig, scale: float = 1.0, twist: tuple[float, ...] = (1, 0, 0, 0, 0, 1)
-) -> MotionModel:
+def two_poses(config: MotionConfig, scale: float = 1.0, twist: tuple[float, ...] = (1, 0, 0, 0, 0, 1)) -> MotionModel:
     model = MotionModel(config, scale)
     for ms in (0, 100):
         model.add(ms * 1_000_000, moving(twist, (0,) * 6, ms * 1e-3))
@@ -71,9 +69,7 @@ def test_predictions_are_clamped_without_changing_their_direction() -> None:
     fast = two_poses(MotionConfig(max_rotation_deg=10, max_translation=50), twist=(1, 2, 0, 0, 0, 5))
     turned = ahead(fast, 900)
     assert np.rad2deg(np.linalg.norm(turned[3:])) == pytest.approx(10)
-    np.testing.assert_allclose(
-        turned / np.linalg.norm(turned), np.array([1, 2, 0, 0, 0, 5]) / np.sqrt(30), atol=1e-9
-    )
+    np.testing.assert_allclose(turned / np.linalg.norm(turned), np.array([1, 2, 0, 0, 0, 5]) / np.sqrt(30), atol=1e-9)
     shifted = ahead(two_poses(MotionConfig(max_translation=0.1), scale=0.5, twist=(3, 0, 0, 0, 0, 0)), 900)
     assert shifted[0] == pytest.approx(0.05)
 

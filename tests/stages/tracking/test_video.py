@@ -1,44 +1,63 @@
-"""The policy step by step: which guess follows from what, and which poses are believed."""
+"""The policy for videos step by step: which step follows from what, and which poses are believed."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
-from fieldpose.stages.tracking.retrieved import RetrievedPoses
-from fieldpose.stages.tracking.track_policy import TrackPolicy
-from support.tracking_world import on_sphere, ring_of_views
+from support.tracking_world import MS, frame_info, on_sphere, ring_of_views
 
-from fieldpose.bus.messages import GuessReason, TrackingState
+from fieldpose.bus.messages import GuessReason, Reason, TrackingState
+from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry import rotation_error_deg
+from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.tracking.config import TrackingConfig
-from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, PoseGuess, PoseResult
+from fieldpose.stages.tracking.policy import Alike, Attempt, Belief, FrameInfo, Look, PoseGuess, PoseResult, Step
+from fieldpose.stages.tracking.priors import Priors
+from fieldpose.stages.tracking.video import VideoPolicy
 
-MS = 1_000_000
 VIEWS = ring_of_views()
 START = on_sphere(0, 30)
 
 
 class Camera:
-    """Hands frames to a policy every 50 ms, one after another, and the results that a test wants."""
+    """Hands frames to a policy every 50 ms, one after another, and the results that a test wants.
 
-    def __init__(self, start: np.ndarray | None = START, **config: object) -> None:
-        self.retrieved = RetrievedPoses()
-        self.policy = TrackPolicy(TrackingConfig(**config), VIEWS, start, self.retrieved)  # type: ignore[arg-type]
+    alike: what every Look is answered with.
+    """
+
+    def __init__(
+        self, start: np.ndarray | None = START, looks: bool = False, awaited: bool = False, **config: object
+    ) -> None:
+        priors = Priors(awaited)
+        self.policy = VideoPolicy(TrackingConfig(**config), VIEWS, priors, start, looks)  # type: ignore[arg-type]
         self.frame_id = -1
+        self.alike: Sequence[np.ndarray] = ()
+
+    def frame(self, skip: int = 0) -> FrameInfo:
+        self.frame_id += 1 + skip
+        return frame_info(self.frame_id, self.frame_id * 50 * MS)
+
+    def step(self) -> Step | None:
+        return self.policy.first_step(self.frame())
 
     def attempt(self, skip: int = 0) -> Attempt:
-        self.frame_id += 1 + skip
-        frame = FrameInfo(self.frame_id, self.frame_id * 50 * MS)
-        guess = self.policy.first_guess(frame)
-        assert guess is not None
-        return Attempt(frame, guess, 0)
+        """The next frame, on its first pass."""
+        attempt = Attempt(self.frame(skip), 0)
+        step = self.policy.first_step(attempt.frame)
+        if isinstance(step, Look):
+            step = self.policy.after_look(attempt, Alike(self.alike))
+        assert isinstance(step, PoseGuess)
+        return attempt.again(step, 0)
 
-    def guess(self) -> PoseGuess:
-        return self.attempt().guess
+    def guess(self, skip: int = 0) -> PoseGuess:
+        return guess_of(self.attempt(skip))
 
     def conclude(self, attempt: Attempt, pose: np.ndarray | None, inliers: int = 100) -> Belief:
         """The belief after a result that is asked no further pass for."""
-        result = PoseResult(attempt.frame.frame_id, 0, pose is not None, pose, None, inliers, 120, 1.0)
+        reason = Reason.TOO_FEW_MATCHES if pose is None else None
+        result = PoseResult(attempt.frame.frame_id, 0, pose, None, inliers, 120, 1.0, reason)
         return self.policy.conclude(attempt, result)
 
     def see(self, pose: np.ndarray | None, inliers: int = 100, skip: int = 0) -> Belief:
@@ -49,12 +68,29 @@ class Camera:
             pass
 
 
+def guess_of(attempt: Attempt) -> PoseGuess:
+    assert attempt.guess is not None
+    return attempt.guess
+
+
 def tracking(**config: object) -> Camera:
     """After ten frames along a circle, one degree a frame; the last at 9 degrees."""
-    camera = Camera(**config)
+    camera = Camera(**config)  # type: ignore[arg-type]
     for i in range(10):
         assert camera.see(on_sphere(i, 30)).state is TrackingState.TRACKING
     return camera
+
+
+def found(pose: np.ndarray, attempt: Attempt) -> PoseResult:
+    return PoseResult(attempt.frame.frame_id, attempt.pass_index, pose, None, 100, 120, 1.0)
+
+
+def failed(attempt: Attempt) -> PoseResult:
+    return PoseResult(attempt.frame.frame_id, attempt.pass_index, reason=Reason.NO_CONSENSUS)
+
+
+def is_view(pose: np.ndarray) -> bool:
+    return any(np.array_equal(pose, view) for view in VIEWS.cam_from_object)
 
 
 def test_the_guess_runs_ahead_with_the_motion() -> None:
@@ -75,19 +111,38 @@ def test_a_limited_track_takes_turns_between_motion_and_keyframes() -> None:
 
 
 def test_after_a_long_gap_the_last_pose_is_the_guess() -> None:
-    camera = tracking()
-    guess = camera.attempt(skip=30).guess
+    guess = tracking().guess(skip=30)
     assert guess.reason is GuessReason.KEYFRAME
     np.testing.assert_array_equal(guess.cam_from_object, on_sphere(9, 30))
+
+
+def test_a_prior_is_the_guess_of_its_frame_alone() -> None:
+    camera = tracking()
+    camera.policy.on_prior(11, prior := on_sphere(70, 20))
+    assert camera.guess().reason is GuessReason.MOTION
+    guess = camera.guess()
+    assert (guess.reason, guess.cam_from_object is prior) == (GuessReason.PRIOR, True)
+    assert camera.guess().reason is GuessReason.MOTION
+
+
+def test_a_frame_whose_prior_is_awaited_has_no_step_without_it() -> None:
+    camera = Camera(awaited=True)
+    frame = camera.frame()
+    assert camera.policy.first_step(frame) is None
+    camera.policy.on_prior(frame.frame_id, prior := on_sphere(70, 20))
+    step = camera.policy.first_step(frame)
+    assert isinstance(step, PoseGuess)
+    assert (step.reason, step.cam_from_object is prior) == (GuessReason.PRIOR, True)
 
 
 def test_a_jump_waits_for_a_second_frame_and_then_begins_a_new_motion() -> None:
     camera = tracking(jump_deg_per_s=10)
     first = camera.see(on_sphere(60, 30))
     assert first.state is TrackingState.LIMITED
+    assert first.reason is Reason.IMPLAUSIBLE_POSE
     assert rotation_error_deg(first.cam_from_object, on_sphere(10, 30)) < 1
     second = camera.see(on_sphere(60, 30))
-    assert second.state is TrackingState.TRACKING
+    assert (second.state, second.reason) == (TrackingState.TRACKING, None)
     np.testing.assert_array_equal(second.cam_from_object, on_sphere(60, 30))
     guess = camera.guess()
     assert guess.reason is GuessReason.MOTION
@@ -112,46 +167,84 @@ def test_what_was_under_way_before_a_recovery_is_not_held_against_it() -> None:
     camera = tracking()
     camera.lose()
     stray = camera.attempt()
-    found = camera.attempt()
-    assert camera.conclude(found, found.guess.cam_from_object).state is TrackingState.TRACKING
+    recovering = camera.attempt()
+    belief = camera.conclude(recovering, guess_of(recovering).cam_from_object)
+    assert belief.state is TrackingState.TRACKING
     assert camera.conclude(stray, None).state is TrackingState.TRACKING
     assert camera.see(None).state is TrackingState.LIMITED
 
 
-def failed(attempt: Attempt) -> PoseResult:
-    return PoseResult(attempt.frame.frame_id, attempt.pass_index, False)
+@pytest.mark.parametrize("start", [None, START], ids=["no start", "start"])
+def test_nothing_is_rendered_before_a_look_while_there_is_no_track(start: np.ndarray | None) -> None:
+    camera = Camera(start, looks=True, lost_after=2)
+    if start is not None:
+        assert [camera.guess().reason for _ in range(3)] == [GuessReason.PRIOR] * 3
+        camera.lose()
+    attempt = Attempt(camera.frame(), 0)
+    assert camera.policy.first_step(attempt.frame) == Look()
+    guess = camera.policy.after_look(attempt, Alike([alike := on_sphere(77, 20)]))
+    assert guess is not None
+    assert (guess.reason, guess.cam_from_object is alike) == (GuessReason.RELOCALISATION, True)
+
+
+def test_a_track_asks_no_look() -> None:
+    camera = tracking(looks=True)
+    assert isinstance(camera.step(), PoseGuess)
+    camera.see(None)
+    assert isinstance(camera.step(), PoseGuess)
+
+
+def test_a_pose_that_waits_to_be_confirmed_needs_no_look() -> None:
+    camera = tracking(looks=True)
+    camera.lose()
+    camera.see(pose := on_sphere(140, 30))
+    step = camera.step()
+    assert isinstance(step, PoseGuess)
+    assert (step.reason, step.cam_from_object is pose) == (GuessReason.RELOCALISATION, True)
+    assert camera.step() == Look()
+
+
+@pytest.mark.parametrize("reason", [None, Reason.NOTHING_ALIKE, Reason.NOT_AVAILABLE, Reason.NO_ANSWER])
+def test_where_nothing_looks_like_a_frame_other_poses_are_tried(reason: Reason | None) -> None:
+    camera = tracking(looks=True)
+    camera.lose()
+    guesses = []
+    for _ in range(4):
+        guess = camera.policy.after_look(Attempt(camera.frame(), 0), Alike(reason=reason))
+        assert guess is not None
+        guesses.append(guess.cam_from_object)
+    np.testing.assert_array_equal(guesses[0], on_sphere(9, 30))
+    assert all(is_view(guess) for guess in guesses[1::2])
 
 
 def test_a_lost_video_goes_on_from_what_looks_like_its_frames() -> None:
-    camera = tracking()
+    camera = tracking(looks=True)
     camera.lose()
+    camera.alike = [on_sphere(77, 20), on_sphere(80, 20)]
     attempt = camera.attempt()
-    alike = on_sphere(77, 20)
-    camera.retrieved.add(attempt.frame.frame_id, attempt.frame.capture_ns, [alike])
-    guess = camera.policy.next_guess(attempt, failed(attempt))
-    assert guess is not None
-    assert guess.reason is GuessReason.RELOCALISATION
-    assert guess.cam_from_object is alike
-    camera.retrieved.add(attempt.frame.frame_id, attempt.frame.capture_ns, [on_sphere(78, 20)])
-    np.testing.assert_array_equal(camera.guess().cam_from_object, on_sphere(78, 20))
+    assert guess_of(attempt).cam_from_object is camera.alike[0]
+    elsewhere = camera.policy.next_step(attempt, failed(attempt))
+    assert isinstance(elsewhere, PoseGuess)
+    assert not any(elsewhere.cam_from_object is pose for pose in camera.alike)
+    second = camera.attempt()
+    assert guess_of(second).cam_from_object is camera.alike[1]
+    camera.alike = [on_sphere(90, 20)]
+    assert camera.guess().cam_from_object is camera.alike[0]
 
 
-def test_a_photo_that_the_last_pose_does_not_lead_to_is_searched_for_at_once() -> None:
-    camera = Camera(sequence="photos", searches=3)
-    assert camera.see(START).state is TrackingState.TRACKING
-    attempt, alike = camera.attempt(), [on_sphere(100, 20), on_sphere(130, 20)]
-    tried = []
-    for _ in range(3):
-        guess = camera.policy.next_guess(attempt, failed(attempt))
-        assert guess is not None
-        assert guess.reason is GuessReason.RELOCALISATION
-        tried.append(guess.cam_from_object)
-        camera.retrieved.add(attempt.frame.frame_id, attempt.frame.capture_ns, alike)
-        attempt = attempt.again(guess, 0)
-    assert camera.policy.next_guess(attempt, failed(attempt)) is None
-    assert tried[1] is alike[0]
-    assert tried[2] is not alike[0]
-    assert camera.attempt().guess.reason is GuessReason.KEYFRAME
+def test_a_retry_of_a_frame_knows_what_looks_like_it_and_not_what_looks_like_another() -> None:
+    camera = tracking(looks=True)
+    camera.lose()
+    camera.alike = [on_sphere(70, 20), on_sphere(75, 20)]
+    first = camera.attempt()
+    camera.alike = [on_sphere(80, 20), on_sphere(85, 20)]
+    second = camera.attempt()
+    retries = []
+    for attempt in (second, first):
+        retry = camera.policy.next_step(attempt, failed(attempt))
+        assert isinstance(retry, PoseGuess)
+        retries.append(retry.cam_from_object)
+    assert not any(retries[1] is pose for pose in camera.alike)
 
 
 def test_a_loss_is_followed_by_the_last_pose_and_by_training_views() -> None:
@@ -160,17 +253,16 @@ def test_a_loss_is_followed_by_the_last_pose_and_by_training_views() -> None:
     guesses = [camera.guess() for _ in range(4)]
     assert {guess.reason for guess in guesses} == {GuessReason.RELOCALISATION}
     np.testing.assert_array_equal(guesses[0].cam_from_object, on_sphere(9, 30))
-    for guess in guesses[1::2]:
-        assert any(np.array_equal(guess.cam_from_object, view) for view in VIEWS.cam_from_object)
+    assert all(is_view(guess.cam_from_object) for guess in guesses[1::2])
 
 
 def test_a_pose_far_from_its_guess_is_tried_as_the_next_guess() -> None:
     camera = tracking()
     camera.lose()
     attempt = camera.attempt()
-    assert camera.conclude(attempt, found := on_sphere(40, 30)).state is TrackingState.LOST
+    assert camera.conclude(attempt, pose := on_sphere(40, 30)).state is TrackingState.LOST
     again = camera.attempt()
-    assert again.guess.cam_from_object is found
+    assert guess_of(again).cam_from_object is pose
     assert camera.conclude(again, on_sphere(40.2, 30)).state is TrackingState.TRACKING
 
 
@@ -186,15 +278,21 @@ def test_a_weak_pose_needs_a_second_frame_to_begin_a_track() -> None:
 def test_a_pose_with_too_few_inliers_is_a_failure() -> None:
     camera = tracking()
     belief = camera.see(on_sphere(10, 30), inliers=5)
-    assert (belief.state, belief.score) == (TrackingState.LIMITED, 0.0)
+    assert (belief.state, belief.score, belief.reason) == (TrackingState.LIMITED, 0.0, Reason.IMPLAUSIBLE_POSE)
+
+
+def test_a_failure_is_reported_with_its_reason() -> None:
+    camera = tracking()
+    assert camera.see(None).reason is Reason.TOO_FEW_MATCHES
+    assert camera.see(on_sphere(11, 30)).reason is None
 
 
 def test_lost_messages_limit_the_track_only_after_the_horizon() -> None:
     camera = tracking()
-    soon = camera.policy.missed(FrameInfo(12, 600 * MS))
-    assert soon.state is TrackingState.TRACKING
+    soon = camera.policy.missed(frame_info(12, 600 * MS), Reason.NO_ANSWER)
+    assert (soon.state, soon.reason) == (TrackingState.TRACKING, Reason.NO_ANSWER)
     assert soon.cam_from_object is not None
-    late = camera.policy.missed(FrameInfo(99, 5_000 * MS))
+    late = camera.policy.missed(frame_info(99, 5_000 * MS), Reason.NO_ANSWER)
     assert (late.state, late.cam_from_object) == (TrackingState.LIMITED, None)
 
 
@@ -203,44 +301,50 @@ def test_a_start_that_does_not_work_out_is_given_up() -> None:
     reasons = []
     for _ in range(5):
         attempt = camera.attempt()
-        reasons.append(attempt.guess.reason)
+        reasons.append(guess_of(attempt).reason)
         camera.conclude(attempt, None)
     assert reasons == [GuessReason.PRIOR] * 3 + [GuessReason.RELOCALISATION] * 2
+
+
+@pytest.mark.parametrize("looks", [False, True])
+def test_without_any_pose_to_begin_with_it_says_so(looks: bool) -> None:
+    nothing = TrainingViews((), np.zeros((0, 4, 4)))
+    with pytest.raises(ConfigError, match="--guess"):
+        VideoPolicy(TrackingConfig(), nothing, Priors(), None, looks)
 
 
 @pytest.mark.parametrize(("moved_deg", "expected"), [(0.1, None), (20, GuessReason.NEXT_PASS)])
 def test_another_pass_is_asked_for_where_the_pose_moved(moved_deg: float, expected: GuessReason | None) -> None:
     camera = Camera()
     attempt = camera.attempt()
-    result = PoseResult(0, 0, True, on_sphere(moved_deg, 30), None, 100, 120, 1.0)
-    guess = camera.policy.next_guess(attempt, result)
-    assert (guess and guess.reason) is expected
+    step = camera.policy.next_step(attempt, found(on_sphere(moved_deg, 30), attempt))
+    assert (step.reason if isinstance(step, PoseGuess) else step) is expected
 
 
 def test_a_track_takes_a_pose_near_its_motion_without_another_pass() -> None:
     camera = tracking()
     attempt = camera.attempt()
-    near, far = (PoseResult(10, 0, True, on_sphere(a, 30), None, 100, 120, 1.0) for a in (13, 40))
-    assert camera.policy.next_guess(attempt, near) is None
-    assert camera.policy.next_guess(attempt, far) is not None
+    near, far = (found(on_sphere(azimuth, 30), attempt) for azimuth in (13, 40))
+    assert camera.policy.next_step(attempt, near) is None
+    assert camera.policy.next_step(attempt, far) is not None
 
 
 def test_no_more_passes_than_configured() -> None:
     camera = Camera(passes=2)
     attempt = camera.attempt()
-    result = PoseResult(0, 0, True, on_sphere(20, 30), None, 100, 120, 1.0)
-    guess = camera.policy.next_guess(attempt, result)
-    assert guess is not None
-    assert camera.policy.next_guess(attempt.again(guess, 0), result) is None
-    far = PoseResult(0, 1, True, on_sphere(40, 30), None, 100, 120, 1.0)
-    assert camera.policy.next_guess(attempt.again(guess, 0), far) is None
+    result = found(on_sphere(20, 30), attempt)
+    guess = camera.policy.next_step(attempt, result)
+    assert isinstance(guess, PoseGuess)
+    again = attempt.again(guess, 0)
+    assert camera.policy.next_step(again, result) is None
+    assert camera.policy.next_step(again, found(on_sphere(40, 30), again)) is None
 
 
 def test_retries_try_a_keyframe_and_then_other_views() -> None:
     camera = tracking(retries=2)
     attempt, reasons = camera.attempt(), []
-    failure = PoseResult(camera.frame_id, 0, False)
-    while (guess := camera.policy.next_guess(attempt, failure)) is not None:
-        reasons.append(guess.reason)
-        attempt = attempt.again(guess, 0)
+    while (step := camera.policy.next_step(attempt, failed(attempt))) is not None:
+        assert isinstance(step, PoseGuess)
+        reasons.append(step.reason)
+        attempt = attempt.again(step, 0)
     assert reasons == [GuessReason.KEYFRAME, GuessReason.RELOCALISATION]

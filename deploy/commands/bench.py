@@ -75,6 +75,8 @@ class Train:
     """Time to train for on each."""
     twin_steps: int = 60
     """Training steps over which the two are compared."""
+    memory_steps: int = 300
+    """Training steps after which the highest memory is read."""
     out: Path = Path("out/bench")
     """Folder of the fields and of the plot, train.png."""
     json: Path | None = None
@@ -88,7 +90,9 @@ class Train:
         datasets = [(path, _SIZES.get(path.resolve().name, 400)) for path in self.datasets or _all_datasets()]
         with progress_console().status("bench train") as status:
             report = _into(status.update, "bench train")
-            figures = train.measure(datasets, self.model, self.minutes, self.twin_steps, self.out, report)
+            figures = train.measure(
+                datasets, self.model, self.minutes, self.twin_steps, self.memory_steps, self.out, report
+            )
         train.plot(figures, self.out / "train.png")
         write_json(self.json, figures)
         _print_train(figures)

@@ -41,13 +41,15 @@ def test_rendering_is_measured_at_each_size(dataset: Path, tmp_path: Path, capsy
 
 def test_training_is_measured_over_time(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     figures = tmp_path / "train.json"
-    arguments = ["--datasets", dataset, "--minutes", 0.05, "--twin-steps", 2, *MODEL, "--out", tmp_path / "plots"]
+    steps = ["--minutes", 0.02, "--twin-steps", 2, "--memory-steps", 2]
+    arguments = ["--datasets", dataset, *steps, *MODEL, "--out", tmp_path / "plots"]
     assert main(["bench", "train", *map(str, arguments), "--json", str(figures)]) == 0
     written = json.loads(figures.read_text())
     assert written["samples_per_s"] > 0
     assert written["speedup"] == pytest.approx(written["samples_per_s"] / written["twin_samples_per_s"])
     assert set(written["psnr_db"]) == {"data"}
-    assert list(written["psnr_db"]["data"]) == ["3"]
+    assert list(written["psnr_db"]["data"]) == ["1.2"]
+    assert written["rss_mb"] > 50
     assert written["depth_error"] == {}
     assert (tmp_path / "plots" / "train.png").read_bytes().startswith(b"\x89PNG")
     assert "PSNR on held-out views" in capsys.readouterr().out

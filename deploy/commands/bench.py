@@ -101,6 +101,41 @@ class Train:
 
 
 @dataclass(frozen=True)
+class Match:
+    """Matchers: time of a pair of images, number of matches, share that are right, on views of the demo scene.
+
+    Example: fieldpose bench match --json out/bench/match.json
+
+    Test images are matched with views from poses up to 15 degrees off. A match is right within 2 pixels of where the
+    view's depth and the image's known pose place it. Matchers without weights on this machine are left out. The JSON
+    file has: machine, threads, pairs, right_px, missing (matcher -> why), sizes (pixels -> matcher -> ms_per_pair,
+    ms_view_known (the view's features kept), matches (a pair's, in the mean), share_right).
+    """
+
+    matchers: tuple[str, ...] = ()
+    """By default all of them."""
+    sizes: tuple[int, ...] = (256, 400)
+    """Pixels of the longer side, of the view and the image alike."""
+    pairs: int = 10
+    """Pairs of each size."""
+    threads: int = 0
+    """Threads of the networks; 0 takes all cores. Beside other work, more than are free take many times as long."""
+    json: Path | None = None
+
+    def run(self) -> int:
+        """Measure, print."""
+        check_writable(self.json)
+        from fieldpose.deploy.benchmarks import match
+
+        with progress_console().status("bench match") as status:
+            report = _into(status.update, "bench match")
+            figures = match.measure(self.matchers, self.sizes, self.pairs, self.threads, report)
+        write_json(self.json, figures)
+        _print_match(figures)
+        return 0
+
+
+@dataclass(frozen=True)
 class Options:
     """Measure how fast the parts are on this machine; run it while nothing else runs.
 
@@ -108,7 +143,9 @@ class Options:
     """
 
     what: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Train, tyro.conf.subcommand("train")]
+        Annotated[Render, tyro.conf.subcommand("render")]
+        | Annotated[Train, tyro.conf.subcommand("train")]
+        | Annotated[Match, tyro.conf.subcommand("match")]
     ]
 
     def run(self) -> int:
@@ -185,3 +222,27 @@ def _print_train(figures: dict[str, Any]) -> None:
             f"{name}: error of depth within the object {error['median']:.2%} (median), {error['p90']:.2%} (90 %)",
             highlight=False,
         )
+
+
+def _print_match(figures: dict[str, Any]) -> None:
+    console = result_console()
+    table = Table(title=f"{figures['pairs']} pairs of a view and an image of the demo scene", title_justify="left")
+    for name in ("pixels", "matcher", "both new, ms", "view known, ms", "matches", "right"):
+        table.add_column(name, justify="left" if name == "matcher" else "right")
+    for size, rows in figures["sizes"].items():
+        for name, row in rows.items():
+            table.add_row(
+                size,
+                name,
+                f"{row['ms_per_pair']:.1f}",
+                f"{row['ms_view_known']:.1f}",
+                f"{row['matches']:.0f}",
+                f"{row['share_right']:.1%}",
+            )
+    console.print(table)
+    console.print(
+        f"{figures['machine']}, {figures['threads']} threads; right: within {figures['right_px']:g} pixels",
+        highlight=False,
+    )
+    for name, reason in figures["missing"].items():
+        console.print(f"{name} is left out: {reason}", highlight=False, markup=False)

@@ -5,10 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support import posed_images
+from support.analytic_scene import AnalyticScene, camera, viewpoint
 
+from fieldpose.deploy.benchmarks.match import RIGHT_PX, Pair, is_right
 from fieldpose.deploy.cli import main
+from fieldpose.stages.geometry import points_at_depth
+from fieldpose.stages.matching.core import MatchedPixels
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.from_dataset import train_field
 
@@ -53,3 +58,35 @@ def test_training_is_measured_over_time(dataset: Path, tmp_path: Path, capsys: p
     assert written["depth_error"] == {}
     assert (tmp_path / "plots" / "train.png").read_bytes().startswith(b"\x89PNG")
     assert "PSNR on held-out views" in capsys.readouterr().out
+
+
+def test_matchers_are_measured_at_each_size(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    figures = tmp_path / "match.json"
+    arguments = ["--matchers", "sift", "loftr", "--sizes", 96, 128, "--pairs", 2, "--threads", 1]
+    assert main(["bench", "match", *map(str, arguments), "--json", str(figures)]) == 0
+    written = json.loads(figures.read_text())
+    assert set(written["sizes"]) == {"96", "128"}
+    for rows in written["sizes"].values():
+        assert {"sift", "loftr"} == rows.keys() | written["missing"].keys()
+        assert rows["sift"]["ms_per_pair"] > 0
+        assert rows["sift"]["ms_view_known"] > 0
+        assert rows["sift"]["matches"] > 10
+        assert 0.5 < rows["sift"]["share_right"] <= 1
+    shown = capsys.readouterr().out
+    assert "view known" in shown
+    assert all(f"{name} is left out: {reason[:20]}" in shown for name, reason in written["missing"].items())
+
+
+def test_matches_are_right_within_two_pixels_of_the_same_point() -> None:
+    seen_by, there = camera(64), viewpoint(32)
+    view = AnalyticScene().render_view(seen_by, viewpoint(20))
+    inside = np.argwhere(view.opacity > 0.999)[::9, ::-1].astype(np.float32)
+    depths = view.depth[inside[:, 1].astype(int), inside[:, 0].astype(int)]
+    points = points_at_depth(seen_by, view.cam_from_object, inside, depths)
+    exact = seen_by.project(points @ there[:3, :3].T + there[:3, 3]).astype(np.float32)
+    pair = Pair(view, view.rgb, seen_by, there)
+    for off, right in ((0.0, True), (0.9 * RIGHT_PX, True), (1.1 * RIGHT_PX, False)):
+        found = MatchedPixels(inside, exact + np.float32([off, 0]), np.ones(len(inside), np.float32))
+        assert is_right(pair, found).tolist() == [right] * len(inside)
+    outside = np.argwhere(view.opacity == 0)[:5, ::-1].astype(np.float32)
+    assert not is_right(pair, MatchedPixels(outside, outside, np.ones(5, np.float32))).any()

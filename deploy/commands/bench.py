@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +12,12 @@ from typing import Annotated, Any
 import tyro
 from rich.table import Table
 
+from fieldpose.deploy.errors import UsageError
 from fieldpose.deploy.reporting.output import check_writable, progress_console, result_console, write_json
 from fieldpose.deploy.scene import demo_file
 from fieldpose.stages.nerf.config import FieldConfig
 
+_LEAST_BYTES = 8
 _DATA = Path("..") / "shared" / "data"
 _SIZES = {"lego": 400, "demo": 400, "fern": 504, "fox": 480}
 
@@ -136,6 +139,49 @@ class Match:
 
 
 @dataclass(frozen=True)
+class Bus:
+    """The bus between two processes: delay, throughput, loss; and what a frame costs as JPEG bytes and as pixels.
+
+    Example: fieldpose bench bus --json out/bench/bus.json
+
+    A frame is sent as a JPEG file that each of three processes decodes, and as pixels that the camera's process has
+    decoded; counted is the CPU time of all processes. The JSON file has: machine, payloads (bytes -> one_way_ms and
+    round_trip_ms (p50, p90, p99), lost (share), messages_per_s, mb_per_s, lost_in_flow, encode_ms and decode_ms of a
+    Frame of that size), receivers, jpeg_quality, frames (size -> jpeg_bytes, rgb8_bytes, decode_jpeg_ms_cpu, and of
+    both jpeg and rgb8: _ms_cpu, of which _ms_cpu_sender and, of one receiver, _ms_cpu_receiver; _ms_to_pixels).
+    """
+
+    payloads: tuple[int, ...] = (1 << 10, 1 << 16, 480 * 360 * 3, 1280 * 720 * 3)
+    """Bytes of a message."""
+    trips: int = 200
+    """Messages of each size, there and back."""
+    flow_mb: float = 200.0
+    """Megabytes of each size, at most 2000 messages, as fast as they go."""
+    sizes: tuple[str, ...] = ("480x360", "640x480", "1280x720")
+    """Of frames, in pixels."""
+    frames: int = 120
+    """Frames of each size, at 60 a second."""
+    json: Path | None = None
+
+    def run(self) -> int:
+        """Measure, print."""
+        check_writable(self.json)
+        sizes = [_size(text) for text in self.sizes]
+        if min(self.payloads, default=0) < _LEAST_BYTES or min(self.trips, self.frames) < 1 or not self.flow_mb > 0:
+            raise UsageError(
+                f"bench bus: payloads of at least {_LEAST_BYTES} bytes, and at least one of each, are needed"
+            )
+        from fieldpose.deploy.benchmarks import bus
+
+        # No display that moves: what it takes would be counted as the sender's.
+        report = _into(progress_console().print, "bench bus")
+        figures = bus.measure(self.payloads, self.trips, self.flow_mb, sizes, self.frames, report)
+        write_json(self.json, figures)
+        _print_bus(figures)
+        return 0
+
+
+@dataclass(frozen=True)
 class Options:
     """Measure how fast the parts are on this machine; run it while nothing else runs.
 
@@ -146,6 +192,7 @@ class Options:
         Annotated[Render, tyro.conf.subcommand("render")]
         | Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Match, tyro.conf.subcommand("match")]
+        | Annotated[Bus, tyro.conf.subcommand("bus")]
     ]
 
     def run(self) -> int:
@@ -160,6 +207,13 @@ def _all_datasets() -> list[Path]:
 
 def _first_dataset() -> Path:
     return _all_datasets()[0]
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", text)
+    if found is None:
+        raise UsageError(f"bench bus: {text!r} is no size; expected for instance 640x480")
+    return int(found[1]), int(found[2])
 
 
 def _into(update: Callable[[str], None], title: str) -> Callable[[str], None]:
@@ -246,3 +300,44 @@ def _print_match(figures: dict[str, Any]) -> None:
     )
     for name, reason in figures["missing"].items():
         console.print(f"{name} is left out: {reason}", highlight=False, markup=False)
+
+
+def _print_bus(figures: dict[str, Any]) -> None:
+    console = result_console()
+    messages = Table(title="messages between two processes; ms at 50, 90 and 99 %", title_justify="left")
+    for name in ("bytes", "one way", "there and back", "lost", "messages/s", "MB/s", "lost", "encode", "decode"):
+        messages.add_column(name, justify="right")
+    for size, row in figures["payloads"].items():
+        messages.add_row(
+            size,
+            _three(row["one_way_ms"]),
+            _three(row["round_trip_ms"]),
+            f"{row['lost']:.1%}",
+            f"{row['messages_per_s']:.0f}",
+            f"{row['mb_per_s']:.0f}",
+            f"{row['lost_in_flow']:.1%}",
+            f"{row['encode_ms']:.3f}",
+            f"{row['decode_ms']:.3f}",
+        )
+    console.print(messages)
+    title = f"a frame to {figures['receivers']} processes; ms of CPU in all, and ms until the pixels are there"
+    frames = Table(title=title, title_justify="left")
+    for name in ("size", "kB", "decode once", "as JPEG", "until", "as pixels", "until", "pixels save"):
+        frames.add_column(name, justify="right")
+    for size, row in figures["frames"].items():
+        frames.add_row(
+            size,
+            f"{row['jpeg_bytes'] / 1e3:.0f}",
+            f"{row['decode_jpeg_ms_cpu']:.2f}",
+            f"{row['jpeg_ms_cpu']:.2f}",
+            f"{row['jpeg_ms_to_pixels']:.2f}",
+            f"{row['rgb8_ms_cpu']:.2f}",
+            f"{row['rgb8_ms_to_pixels']:.2f}",
+            f"{row['jpeg_ms_cpu'] - row['rgb8_ms_cpu']:.2f}",
+        )
+    console.print(frames)
+    console.print(f"{figures['machine']}; JPEG of quality {figures['jpeg_quality']}", highlight=False)
+
+
+def _three(percentiles: dict[str, float | None]) -> str:
+    return "  ".join("-" if ms is None else f"{ms:.2f}" for ms in percentiles.values())

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from support import posed_images
 from support.analytic_scene import AnalyticScene, camera, viewpoint
@@ -18,6 +23,15 @@ from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.from_dataset import train_field
 
 SMALL = FieldConfig(levels=2, log2_table=8, hidden=8, colour_hidden=8, occupancy_resolution=16, finest_resolution=32)
+KILLED = """
+import os, signal
+import psutil
+from fieldpose.deploy.benchmarks import echo, other_end
+with echo.hub() as hub, other_end.other_process(hub), echo.session(hub) as bus:
+    echo.Echo(bus)
+    print(psutil.Process().children()[0].pid, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
 MODEL = ["--model.levels", 2, "--model.log2-table", 8, "--model.occupancy-resolution", 16]
 
 
@@ -90,3 +104,64 @@ def test_matches_are_right_within_two_pixels_of_the_same_point() -> None:
         assert is_right(pair, found).tolist() == [right] * len(inside)
     outside = np.argwhere(view.opacity == 0)[:5, ::-1].astype(np.float32)
     assert not is_right(pair, MatchedPixels(outside, outside, np.ones(5, np.float32))).any()
+
+
+def test_the_bus_is_measured_by_message_and_by_frame(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    figures = tmp_path / "bus.json"
+    few = ["--trips", 5, "--flow-mb", 0.2, "--frames", 3]
+    arguments = ["--payloads", 1024, 65536, "--sizes", "48x36", *few]
+    before = {process.pid for process in psutil.Process().children(recursive=True)}
+    assert main(["bench", "bus", *map(str, arguments), "--json", str(figures)]) == 0
+    assert {process.pid for process in psutil.Process().children(recursive=True)} <= before
+    written = json.loads(figures.read_text())
+    assert set(written["payloads"]) == {"1024", "65536"}
+    for size, row in written["payloads"].items():
+        assert row["lost"] == row["lost_in_flow"] == 0
+        for way in ("one_way_ms", "round_trip_ms"):
+            assert 0 < row[way]["p50"] <= row[way]["p90"] <= row[way]["p99"]
+        assert row["one_way_ms"]["p50"] < row["round_trip_ms"]["p99"]
+        assert row["mb_per_s"] == pytest.approx(row["messages_per_s"] * int(size) / 1e6)
+        assert row["encode_ms"] > 0
+        assert row["decode_ms"] > 0
+    (frame,) = written["frames"].values()
+    assert frame["rgb8_bytes"] == 48 * 36 * 3
+    assert 0 < frame["jpeg_bytes"] < frame["rgb8_bytes"]
+    for way in ("jpeg", "rgb8"):
+        once, each = frame[f"{way}_ms_cpu_sender"], frame[f"{way}_ms_cpu_receiver"]
+        assert min(once, each, frame[f"{way}_ms_to_pixels"]) > 0
+        assert frame[f"{way}_ms_cpu"] == pytest.approx(once + written["receivers"] * each)
+    assert "pixels save" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--sizes", "640"], "640x480"),
+        (["--payloads", "4"], "at least 8 bytes"),
+        (["--frames", "0"], "at least one of each"),
+    ],
+)
+def test_a_bus_that_cannot_be_measured_so_is_told(
+    arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", "bus", *arguments]) == 2
+    assert complaint in capsys.readouterr().err
+
+
+def test_the_other_process_ends_with_the_one_that_started_it() -> None:
+    killed = subprocess.run(
+        [sys.executable, "-P", "-c", KILLED], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert killed.returncode == -signal.SIGKILL
+    (pid,) = map(int, killed.stdout.split())
+    deadline = time.monotonic() + 10
+    while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < deadline, "still running"
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("what", ["render", "train", "match", "bus"])
+def test_help_of_each_has_an_example(what: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["bench", what, "--help"])
+    assert f"Example: fieldpose bench {what} --json" in " ".join(capsys.readouterr().out.split())

@@ -15,6 +15,7 @@ import pytest
 from support import posed_images
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
+from fieldpose.deploy.benchmarks import machine
 from fieldpose.deploy.benchmarks.match import RIGHT_PX, Pair, is_right
 from fieldpose.deploy.cli import main
 from fieldpose.stages.geometry import points_at_depth
@@ -41,6 +42,14 @@ def dataset(tmp_path: Path) -> Path:
     return tmp_path / "data"
 
 
+@pytest.fixture
+def one_core(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks so small take many times as long where their threads wait for each other, as on a busy machine."""
+    monkeypatch.setattr(machine, "cores", lambda: 1)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+
+@pytest.mark.usefixtures("one_core")
 def test_rendering_is_measured_at_each_size(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     field, figures = tmp_path / "field.safetensors", tmp_path / "render.json"
     train_field(dataset, field, 32, training=TrainingConfig(steps=20), config=SMALL)
@@ -58,6 +67,7 @@ def test_rendering_is_measured_at_each_size(dataset: Path, tmp_path: Path, capsy
     assert "times faster" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("one_core")
 def test_training_is_measured_over_time(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     figures = tmp_path / "train.json"
     steps = ["--minutes", 0.02, "--twin-steps", 2, "--memory-steps", 2]

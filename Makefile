@@ -16,7 +16,7 @@ help:
 	@echo "make demo      the embedded scene through the whole pipeline; writes out/demo"
 	@echo "make test      lint, types, architecture, tests"
 	@echo "make lint      only the first three"
-	@echo "make bench     how fast rendering and training are here; half an hour, writes out/bench"
+	@echo "make bench     how fast rendering, training, matching and the bus are here; half an hour, writes out/bench"
 
 install: $(INSTALLED)
 
@@ -44,6 +44,8 @@ test: lint
 bench: $(INSTALLED)
 	$(BIN)/fieldpose bench train --json out/bench/train.json
 	$(BIN)/fieldpose bench render --json out/bench/render.json
+	$(BIN)/fieldpose bench match --json out/bench/match.json
+	$(BIN)/fieldpose bench bus --json out/bench/bus.json
 
 clean:
 	rm -rf out build *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache .import_linter_cache

@@ -7,7 +7,6 @@ import platform
 import shutil
 import socket
 import statistics
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,7 +16,6 @@ from typing import Literal
 
 import psutil
 
-from fieldpose.deploy.processes.endpoints import free_port
 from fieldpose.errors import FieldposeError
 
 _PACKAGES = ("torch", "kornia", "numba", "numpy", "opencv-python-headless", "eclipse-zenoh", "mcap", "supervisor")
@@ -165,38 +163,14 @@ def dataset(path: Path) -> Iterator[Finding]:
 
 
 def _round_trips_ms() -> list[float]:
-    from fieldpose.bus.topics import VIEW
-    from fieldpose.bus.transport import ZenohBus, serve_hub
+    from fieldpose.deploy.benchmarks import echo
+    from fieldpose.errors import TransportError
 
-    hub, stop = f"tcp/127.0.0.1:{free_port()}", threading.Event()
-    serving = threading.Thread(target=serve_hub, args=(hub, None, stop), daemon=True)
-    serving.start()
-    here, there = ZenohBus(hub), ZenohBus(hub)
-    try:
-        here.wait_for_hub(5.0)
-        there.wait_for_hub(5.0)
-        came = threading.Event()
-        there.subscribe(
-            "fieldpose/doctor/there", lambda key, data, at: there.put("fieldpose/doctor/back", data, VIEW), 8
-        )
-        here.subscribe("fieldpose/doctor/back", lambda key, data, at: came.set(), 8)
-        return [
-            _round_trip_ms(lambda: here.put("fieldpose/doctor/there", bytes(_ECHO_BYTES), VIEW), came)
-            for _ in range(_ECHOES)
-        ]
-    finally:
-        here.close()
-        there.close()
-        stop.set()
-        serving.join()
-
-
-def _round_trip_ms(send: Callable[[], None], came: threading.Event) -> float:
-    """Sends until an answer comes, as sessions take a moment to find each other."""
-    for _ in range(50):
-        came.clear()
-        began = time.perf_counter()
-        send()
-        if came.wait(0.2):
-            return (time.perf_counter() - began) * 1e3
-    raise FieldposeError("nothing comes back over the bus")
+    with echo.hub() as endpoint, echo.session(endpoint) as here, echo.session(endpoint) as there:
+        echo.answer(there)
+        sender = echo.Echo(here)
+        trips = [sender.round_trip_ms(_ECHO_BYTES) for _ in range(_ECHOES)]
+    came = [ms for ms in trips if ms is not None]
+    if len(came) < len(trips):
+        raise TransportError(f"{len(trips) - len(came)} of {len(trips)} messages did not come back over the bus")
+    return came

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -100,26 +100,32 @@ def over_time(
     return Course(scores, errors)
 
 
+def _peak_mb(dataset: Path, size: int, model: FieldConfig, steps: int) -> float:
+    shape = [argument for name, value in asdict(model).items() for argument in (f"--model.{name}", value)]
+    with tempfile.TemporaryDirectory() as folder:
+        field = Path(folder) / "field.safetensors"
+        training = ("--size", size, "--out", field, "--training.steps", steps)
+        return peak_mb(_LEARN, "train", dataset, *training, *shape)
+
+
 def measure(
     datasets: Sequence[tuple[Path, int]],
     model: FieldConfig,
     minutes: float,
     steps: int,
+    memory_steps: int,
     out: Path,
     report: Callable[[str], None],
 ) -> dict[str, Any]:
     """Everything that `fieldpose bench train` prints, as its JSON.
 
-    The twin takes so many steps on the first dataset; every dataset (its folder, pixels) is learnt for so many minutes
-    and its field kept in `out`.
+    The twin takes so many steps on the first dataset; a process of its own, whose memory is looked at, takes
+    `memory_steps`; every dataset (its folder, pixels) is learnt for so many minutes and its field kept in `out`.
     """
     report("the plain twin")
     rates = compare(*datasets[0], model, steps)
     report("memory")
-    first, size = datasets[0]
-    with tempfile.TemporaryDirectory() as folder:
-        field = Path(folder) / "field.safetensors"
-        memory = peak_mb(_LEARN, "train", first, "--size", size, "--out", field, "--training.steps", 300)
+    memory = _peak_mb(*datasets[0], model, memory_steps)
     courses = {path.resolve().name: over_time(path, size, model, minutes, out, report) for path, size in datasets}
     return {
         "machine": machine.describe(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,8 +14,10 @@ from rich.table import Table
 
 from fieldpose.deploy.reporting.output import check_writable, progress_console, result_console, write_json
 from fieldpose.deploy.scene import demo_file
+from fieldpose.errors import UsageError
 from fieldpose.stages.nerf.config import FieldConfig
 
+_LEAST_BYTES = 8
 _DATA = Path("..") / "shared" / "data"
 _SIZES = {"lego": 400, "demo": 400, "fern": 504, "fox": 480}
 
@@ -75,6 +78,8 @@ class Train:
     """Time to train for on each."""
     twin_steps: int = 60
     """Training steps over which the two are compared."""
+    memory_steps: int = 300
+    """Training steps after which the highest memory is read."""
     out: Path = Path("out/bench")
     """Folder of the fields and of the plot, train.png."""
     json: Path | None = None
@@ -88,11 +93,91 @@ class Train:
         datasets = [(path, _SIZES.get(path.resolve().name, 400)) for path in self.datasets or _all_datasets()]
         with progress_console().status("bench train") as status:
             report = _into(status.update, "bench train")
-            figures = train.measure(datasets, self.model, self.minutes, self.twin_steps, self.out, report)
+            figures = train.measure(
+                datasets, self.model, self.minutes, self.twin_steps, self.memory_steps, self.out, report
+            )
         train.plot(figures, self.out / "train.png")
         write_json(self.json, figures)
         _print_train(figures)
         print(f"written: {self.out / 'train.png'}")
+        return 0
+
+
+@dataclass(frozen=True)
+class Match:
+    """Matchers: time of a pair of images, number of matches, share that are right, on views of the demo scene.
+
+    Example: fieldpose bench match --json out/bench/match.json
+
+    Test images are matched with views from poses up to 15 degrees off. A match is right within 2 pixels of where the
+    view's depth and the image's known pose place it. Matchers without weights on this machine are left out. The JSON
+    file has: machine, threads, pairs, right_px, missing (matcher -> why), sizes (pixels -> matcher -> ms_per_pair,
+    ms_view_known (the view's features kept), matches (a pair's, in the mean), share_right).
+    """
+
+    matchers: tuple[str, ...] = ()
+    """By default all of them."""
+    sizes: tuple[int, ...] = (256, 400)
+    """Pixels of the longer side, of the view and the image alike."""
+    pairs: int = 10
+    """Pairs of each size."""
+    threads: int = 0
+    """Threads of the networks; 0 takes all cores. Beside other work, more than are free take many times as long."""
+    json: Path | None = None
+
+    def run(self) -> int:
+        """Measure, print."""
+        check_writable(self.json)
+        from fieldpose.deploy.benchmarks import match
+
+        with progress_console().status("bench match") as status:
+            report = _into(status.update, "bench match")
+            figures = match.measure(self.matchers, self.sizes, self.pairs, self.threads, report)
+        write_json(self.json, figures)
+        _print_match(figures)
+        return 0
+
+
+@dataclass(frozen=True)
+class Bus:
+    """The bus between two processes: delay, throughput, loss; and what a frame costs as JPEG bytes and as pixels.
+
+    Example: fieldpose bench bus --json out/bench/bus.json
+
+    A frame is sent as a JPEG file that each of three processes decodes, and as pixels that the camera's process has
+    decoded; counted is the CPU time of all processes. The JSON file has: machine, payloads (bytes -> one_way_ms and
+    round_trip_ms (p50, p90, p99), lost (share), messages_per_s, mb_per_s, lost_in_flow, encode_ms and decode_ms of a
+    Frame of that size), receivers, jpeg_quality, frames (size -> jpeg_bytes, rgb8_bytes, decode_jpeg_ms_cpu, and of
+    both jpeg and rgb8: _ms_cpu, of which _ms_cpu_sender and, of one receiver, _ms_cpu_receiver; _ms_to_pixels).
+    """
+
+    payloads: tuple[int, ...] = (1 << 10, 1 << 16, 480 * 360 * 3, 1280 * 720 * 3)
+    """Bytes of a message."""
+    trips: int = 200
+    """Messages of each size, there and back."""
+    flow_mb: float = 200.0
+    """Megabytes of each size, at most 2000 messages, as fast as they go."""
+    sizes: tuple[str, ...] = ("480x360", "640x480", "1280x720")
+    """Of frames, in pixels."""
+    frames: int = 120
+    """Frames of each size, at 60 a second."""
+    json: Path | None = None
+
+    def run(self) -> int:
+        """Measure, print."""
+        check_writable(self.json)
+        sizes = [_size(text) for text in self.sizes]
+        if min(self.payloads, default=0) < _LEAST_BYTES or min(self.trips, self.frames) < 1 or not self.flow_mb > 0:
+            raise UsageError(
+                f"bench bus: payloads of at least {_LEAST_BYTES} bytes, and at least one of each, are needed"
+            )
+        from fieldpose.deploy.benchmarks import bus
+
+        # No display that moves: what it takes would be counted as the sender's.
+        report = _into(progress_console().print, "bench bus")
+        figures = bus.measure(self.payloads, self.trips, self.flow_mb, sizes, self.frames, report)
+        write_json(self.json, figures)
+        _print_bus(figures)
         return 0
 
 
@@ -104,7 +189,10 @@ class Options:
     """
 
     what: tyro.conf.OmitSubcommandPrefixes[
-        Annotated[Render, tyro.conf.subcommand("render")] | Annotated[Train, tyro.conf.subcommand("train")]
+        Annotated[Render, tyro.conf.subcommand("render")]
+        | Annotated[Train, tyro.conf.subcommand("train")]
+        | Annotated[Match, tyro.conf.subcommand("match")]
+        | Annotated[Bus, tyro.conf.subcommand("bus")]
     ]
 
     def run(self) -> int:
@@ -119,6 +207,13 @@ def _all_datasets() -> list[Path]:
 
 def _first_dataset() -> Path:
     return _all_datasets()[0]
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"([1-9]\d{0,3})x([1-9]\d{0,3})", text)
+    if found is None:
+        raise UsageError(f"bench bus: {text!r} is no size; expected for instance 640x480")
+    return int(found[1]), int(found[2])
 
 
 def _into(update: Callable[[str], None], title: str) -> Callable[[str], None]:
@@ -181,3 +276,68 @@ def _print_train(figures: dict[str, Any]) -> None:
             f"{name}: error of depth within the object {error['median']:.2%} (median), {error['p90']:.2%} (90 %)",
             highlight=False,
         )
+
+
+def _print_match(figures: dict[str, Any]) -> None:
+    console = result_console()
+    table = Table(title=f"{figures['pairs']} pairs of a view and an image of the demo scene", title_justify="left")
+    for name in ("pixels", "matcher", "both new, ms", "view known, ms", "matches", "right"):
+        table.add_column(name, justify="left" if name == "matcher" else "right")
+    for size, rows in figures["sizes"].items():
+        for name, row in rows.items():
+            table.add_row(
+                size,
+                name,
+                f"{row['ms_per_pair']:.1f}",
+                f"{row['ms_view_known']:.1f}",
+                f"{row['matches']:.0f}",
+                f"{row['share_right']:.1%}",
+            )
+    console.print(table)
+    console.print(
+        f"{figures['machine']}, {figures['threads']} threads; right: within {figures['right_px']:g} pixels",
+        highlight=False,
+    )
+    for name, reason in figures["missing"].items():
+        console.print(f"{name} is left out: {reason}", highlight=False, markup=False)
+
+
+def _print_bus(figures: dict[str, Any]) -> None:
+    console = result_console()
+    messages = Table(title="messages between two processes; ms at 50, 90 and 99 %", title_justify="left")
+    for name in ("bytes", "one way", "there and back", "lost", "messages/s", "MB/s", "lost", "encode", "decode"):
+        messages.add_column(name, justify="right")
+    for size, row in figures["payloads"].items():
+        messages.add_row(
+            size,
+            _three(row["one_way_ms"]),
+            _three(row["round_trip_ms"]),
+            f"{row['lost']:.1%}",
+            f"{row['messages_per_s']:.0f}",
+            f"{row['mb_per_s']:.0f}",
+            f"{row['lost_in_flow']:.1%}",
+            f"{row['encode_ms']:.3f}",
+            f"{row['decode_ms']:.3f}",
+        )
+    console.print(messages)
+    title = f"a frame to {figures['receivers']} processes; ms of CPU in all, and ms until the pixels are there"
+    frames = Table(title=title, title_justify="left")
+    for name in ("size", "kB", "decode once", "as JPEG", "until", "as pixels", "until", "pixels save"):
+        frames.add_column(name, justify="right")
+    for size, row in figures["frames"].items():
+        frames.add_row(
+            size,
+            f"{row['jpeg_bytes'] / 1e3:.0f}",
+            f"{row['decode_jpeg_ms_cpu']:.2f}",
+            f"{row['jpeg_ms_cpu']:.2f}",
+            f"{row['jpeg_ms_to_pixels']:.2f}",
+            f"{row['rgb8_ms_cpu']:.2f}",
+            f"{row['rgb8_ms_to_pixels']:.2f}",
+            f"{row['jpeg_ms_cpu'] - row['rgb8_ms_cpu']:.2f}",
+        )
+    console.print(frames)
+    console.print(f"{figures['machine']}; JPEG of quality {figures['jpeg_quality']}", highlight=False)
+
+
+def _three(percentiles: dict[str, float | None]) -> str:
+    return "  ".join("-" if ms is None else f"{ms:.2f}" for ms in percentiles.values())

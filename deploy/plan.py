@@ -41,6 +41,11 @@ class Plan:
         """Whether frames stand each by itself: photos, and frames with guesses of their own."""
         return self.settings.tracking.sequence == "photos" or self.begins.by_frame
 
+    @property
+    def in_flight(self) -> int:
+        """How many frames are worked on at once: in lockstep one, whatever the depth is."""
+        return 1 if self.settings.camera.pace == "lockstep" else self.settings.tracking.depth
+
 
 def resolve(settings: Settings, views: TrainingViews | None, field: Path | None = None) -> Plan:
     """Decide what the settings leave open, for their source and for a field with these training views.

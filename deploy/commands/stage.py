@@ -81,14 +81,15 @@ class Options:
 
 def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handler]) -> None:
     settings = options.settings
-    threads = options.threads or threads_of(row, settings.tracking.depth)
+    plan = resolve(settings, _views(options.field), options.field)
+    threads = options.threads or threads_of(row, plan.in_flight)
     os.environ.update(thread_environment(threads))
-    parts = Parts(resolve(settings, _views(options.field), options.field), threads)
+    parts = Parts(plan, threads)
     if options.field is not None and row.renders:
         compile_kernels(options.field, row.name)
     address = settings.address
     bus = ZenohBus(options.connect, options.listen or peer_address(options.connect))
-    _tell(parts.plan, row)
+    _tell(plan, row)
 
     def wait_until_ready() -> None:
         wait_for(bus, address, options.wait_for, _START_S)

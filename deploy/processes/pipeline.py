@@ -101,7 +101,7 @@ def programs(run: Run, folder: Path, hub: str) -> list[Program]:
     programs = []
     for name in run.processes:
         row = BY_NAME[name]
-        threads = threads_of(row, settings.tracking.depth)
+        threads = threads_of(row, run.plan.in_flight)
         command = [sys.executable, "-P", "-m", "fieldpose", "stage", name, "--connect", hub, "--config", str(config)]
         if run.plan.field is not None:
             command += ["--field", str(run.plan.field.resolve())]

@@ -57,8 +57,11 @@ class NumbaRenderer:
         return RenderedRays(np.clip(rgb, 0, 1, out=rgb), depth / length, opacity)
 
     def _chunk(self, total: int, least: int, most: int) -> int:
-        """So many at once that each thread comes several times: some take much longer than others."""
-        return int(np.clip(total // (4 * self._workers.threads), least, most))
+        """So many at once that each thread comes several times: some take much longer than others.
+
+        A multiple of `least`: rays are traced in the same packets, and round in the same way, whatever the threads.
+        """
+        return int(np.clip(total // (4 * self._workers.threads) // least * least, least, most))
 
     def render_rays_jacobian(
         self, origins: np.ndarray, directions: np.ndarray, channel_weights: np.ndarray

@@ -46,6 +46,8 @@ class GuessReason(StrEnum):
 
 
 class TrackingState(StrEnum):
+    """How far tracking trusts its pose: TRACKING is sure, LIMITED is not, and the other two have none."""
+
     INITIALIZING = "initializing"
     TRACKING = "tracking"
     LIMITED = "limited"

@@ -40,6 +40,7 @@ from fieldpose.bus.topics import (
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan
 from fieldpose.errors import UsageError
+from fieldpose.stages.camera.sources import EXTERNAL
 
 HUB, RECORDER, CAMERA = "hub", "recorder", "camera"
 OBSERVER = "observer"
@@ -155,7 +156,10 @@ def _refinement(parts: Parts, launch: Launch) -> Handler:
 GRAPH: tuple[Process, ...] = (
     Process(HUB, None, stop_s=1.0),
     Process(RECORDER, _recorder, reads=tuple(topic for topic in ALL if topic.recorded), stop_s=60.0),
-    Process(CAMERA, _camera, reads=(STATE, POSE, FAILURE), writes=(TRUTH, FRAME, CAMERA_INFO)),
+    Process(
+        CAMERA, _camera, reads=(STATE, POSE, FAILURE), writes=(TRUTH, FRAME, CAMERA_INFO),
+        wanted=lambda plan: plan.settings.camera.source != EXTERNAL,
+    ),
     Process(
         "perturbation", _perturbation, reads=(TRUTH,), writes=(PRIOR,),
         wanted=lambda plan: plan.begins.disturbance is not None,

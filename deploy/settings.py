@@ -96,6 +96,12 @@ def changed(config: T, changes: dict[str, Any], origin: str, place: str = "") ->
         raise ConfigError(f"{origin}: {error}") from error
 
 
+def overridden(config: T, **values: object) -> T:
+    """A dataclass with the values that are given, not None. Raises ConfigError for those out of range."""
+    given = {name: value for name, value in values.items() if value is not None}
+    return dataclasses.replace(config, **given)  # type: ignore[type-var]
+
+
 def to_json(settings: Settings) -> bytes:
     """Every setting with its value, as a file that `read_settings` takes."""
     return msgspec.json.format(msgspec.json.encode(settings, enc_hook=str), indent=2) + b"\n"

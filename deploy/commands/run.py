@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
 import tyro
 
@@ -14,15 +14,13 @@ from fieldpose.deploy.processes.pipeline import Run, run_pipeline
 from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
 from fieldpose.deploy.reporting.report import live_line, print_plan, print_summary
 from fieldpose.deploy.reporting.results import RunResult, summarise, to_csv
-from fieldpose.deploy.settings import Settings
+from fieldpose.deploy.settings import Settings, overridden
 from fieldpose.errors import UsageError
 from fieldpose.stages.camera.config import Pace
 from fieldpose.stages.nerf.field import load_field
 from fieldpose.stages.nerf.training_views import training_views
 
 INTERRUPTED = 130
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,8 @@ class Options:
     field: tyro.conf.Positional[Path]
     """The field (.safetensors) of the object or scene."""
     source: str | None = None
-    """folder:DIR, dataset:DIR:test, video:FILE, camera:0 or mcap:FILE (short for --camera.source)."""
+    """folder:DIR, dataset:DIR:test, video:FILE, camera:0 or mcap:FILE; bus: other programs send the frames, see
+    examples/ (short for --camera.source)."""
     record: Path | None = None
     """Record every message into this file (.mcap)."""
     json: Path | None = None
@@ -91,15 +90,17 @@ class Options:
     def with_shortcuts(self) -> Settings:
         """The settings with the short flags applied. Raises UsageError, and ConfigError for bad values."""
         s = self.settings
-        camera = _with(s.camera, source=self.source, size=self.size, pace=self.pace)
+        camera = overridden(s.camera, source=self.source, size=self.size, pace=self.pace)
         if not camera.source:
             raise UsageError("no source of images; give --source, for instance --source folder:DIR")
-        return _with(
+        return overridden(
             s,
             camera=camera,
-            tracking=_with(s.tracking, guess=self.guess, passes=self.passes, depth=self.depth, sequence=self.sequence),
-            matching=_with(s.matching, matcher=self.matcher),
-            refinement=_with(s.refinement, when=self.refine),
+            tracking=overridden(
+                s.tracking, guess=self.guess, passes=self.passes, depth=self.depth, sequence=self.sequence
+            ),
+            matching=overridden(s.matching, matcher=self.matcher),
+            refinement=overridden(s.refinement, when=self.refine),
         )
 
 
@@ -116,10 +117,3 @@ def give_out(outcome: RunResult, title: str, json: Path | None, csv: Path | None
     if csv is not None:
         write_bytes(csv, to_csv(outcome.frames))
     return summary
-
-
-def _with(config: T, **values: object) -> T:
-    return replace(
-        config,  # type: ignore[type-var]
-        **{name: value for name, value in values.items() if value is not None},
-    )

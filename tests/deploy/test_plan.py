@@ -1,0 +1,102 @@
+"""What is left open is decided once, by source, field and machine, and each decision is told."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from support.tracking_world import ring_of_views
+
+from fieldpose.deploy.plan import resolve
+from fieldpose.deploy.settings import Settings, changed, read_settings, to_json
+from fieldpose.errors import ConfigError, SourceError
+from fieldpose.stages.nerf.training_views import TrainingViews
+
+VIEWS = ring_of_views()
+KNOWN = TrainingViews(VIEWS.names, VIEWS.cam_from_object, np.zeros((len(VIEWS.names), 4, 64), np.int8))
+
+
+def settings(**changes: Any) -> Settings:
+    return changed(Settings(), changes, "test")
+
+
+def from_source(source: str, **changes: Any) -> Settings:
+    return settings(camera={"source": source}, **changes)
+
+
+@pytest.mark.parametrize("source", ["video:a.mp4", "camera:0", "mcap:a.mcap", "bus", ""])
+def test_videos_get_small_views_used_again_and_no_refinement(source: str) -> None:
+    plan = resolve(from_source(source), KNOWN)
+    chosen = plan.settings
+    assert (chosen.tracking.sequence, chosen.rendering.size, chosen.refinement.when) == ("video", 256, "never")
+    assert chosen.rendering.reuse_angle_deg == 5.0
+    assert not plan.independent
+    assert chosen.camera.pace == ("live" if source else "auto")
+
+
+@pytest.mark.parametrize("source", ["folder:a", "dataset:a:test"])
+def test_photos_stand_each_by_itself_and_are_refined_one_after_the_other(source: str) -> None:
+    plan = resolve(from_source(source), KNOWN)
+    chosen = plan.settings
+    assert (chosen.tracking.sequence, chosen.rendering.size, chosen.refinement.when) == ("photos", 400, "always")
+    assert chosen.rendering.reuse_angle_deg == 0.0
+    assert plan.independent
+    assert (chosen.camera.pace, plan.in_flight) == ("lockstep", 1)
+
+
+def test_what_is_said_is_not_decided_anew() -> None:
+    said = from_source(
+        "camera:0", tracking={"sequence": "photos"}, rendering={"size": 320, "reuse_angle_deg": 2.0},
+        refinement={"when": "never"}, matching={"device": "meta"}, backend="torch",
+    )  # fmt: skip
+    chosen = resolve(said, KNOWN).settings
+    assert (chosen.tracking.sequence, chosen.rendering.size, chosen.rendering.reuse_angle_deg) == ("photos", 320, 2.0)
+    assert (chosen.refinement.when, chosen.matching.device, chosen.backend) == ("never", "meta", "torch")
+
+
+@pytest.mark.parametrize("source", ["", "folder:a", "mcap:a.mcap"])
+def test_a_plan_read_back_is_the_same_plan(source: str, tmp_path: Any) -> None:
+    """As the processes get it, and a recording keeps it."""
+    first = resolve(from_source(source, tracking={"guess": "perturb:10-40deg,0.2"}), KNOWN)
+    path = tmp_path / "settings.json"
+    path.write_bytes(to_json(first.settings))
+    again = resolve(read_settings(path), KNOWN)
+    assert again.settings == first.settings
+    assert again.begins == first.begins
+    assert (again.looks, again.independent) == (first.looks, first.independent)
+    assert "auto" not in to_json(first.settings).decode().replace('"holdout": "auto"', "").replace(
+        '"pace": "auto"' if not source else "-", ""
+    )
+
+
+def test_guesses_for_each_frame_make_frames_independent() -> None:
+    plan = resolve(from_source("mcap:a.mcap", tracking={"guess": "perturb:10-40deg,0.2"}), KNOWN)
+    assert plan.begins.disturbance is not None
+    assert plan.independent
+    assert plan.settings.rendering.reuse_angle_deg == 0.0
+    assert plan.settings.rendering.size == 256
+    start = resolve(from_source("mcap:a.mcap", tracking={"guess": "train:r_3"}), KNOWN)
+    np.testing.assert_array_equal(start.begins.start, VIEWS.cam_from_object[3])
+
+
+def test_retrieval_is_asked_where_the_field_remembers_its_views() -> None:
+    assert resolve(settings(), KNOWN).looks
+    forgetful = resolve(settings(), VIEWS)
+    assert not forgetful.looks
+    assert "train it again" in forgetful.notes["retrieval"]
+    assert not resolve(settings(retrieval={"candidates": 0}), KNOWN).looks
+
+
+def test_every_decision_is_told() -> None:
+    notes = resolve(from_source("folder:a"), KNOWN).notes
+    told = {"sequence", "retrieval", "guess", "backend", "pace", "view size", "views used again", "refinement"}
+    assert set(notes) == told
+    assert all("auto" in notes[name] for name in told - {"retrieval", "guess"})
+
+
+def test_what_cannot_be_is_refused_before_anything_starts() -> None:
+    with pytest.raises(SourceError, match="expected one of"):
+        resolve(from_source("tape:3"), KNOWN)
+    with pytest.raises(ConfigError, match="nowhere"):
+        resolve(settings(tracking={"guess": "nowhere.json"}), KNOWN)

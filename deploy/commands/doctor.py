@@ -49,7 +49,8 @@ class Options:
             yield from check()
 
     def _checks(self) -> Iterator[Check]:
-        yield from (checks.machine, checks.packages, checks.bus, checks.backend, checks.kernels, checks.weights, checks.demo_scene)
+        yield from (checks.machine, checks.packages, checks.bus, checks.backend, checks.kernels)
+        yield from (checks.weights, checks.demo_scene)
         if self.field is not None:
             yield partial(checks.field, self.field)
         if self.dataset is not None:

@@ -96,6 +96,18 @@ def changed(config: T, changes: dict[str, Any], origin: str, place: str = "") ->
         raise ConfigError(f"{origin}: {error}") from error
 
 
+def without_unknown(config: Any, changes: dict[str, Any], place: str = "") -> list[str]:
+    """Take what `config` does not have out of the changes, nested tables too; returns the names."""
+    names = {item.name for item in dataclasses.fields(config)}
+    gone = [f"{place}{key}" for key in changes if key not in names]
+    for key in set(changes) - names:
+        del changes[key]
+    for key, value in changes.items():
+        if dataclasses.is_dataclass(getattr(config, key)) and isinstance(value, dict):
+            gone += without_unknown(getattr(config, key), value, f"{place}{key}.")
+    return gone
+
+
 def overridden(config: T, **values: object) -> T:
     """A dataclass with the values that are given, not None. Raises ConfigError for those out of range."""
     given = {name: value for name, value in values.items() if value is not None}

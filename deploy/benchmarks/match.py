@@ -15,7 +15,7 @@ from fieldpose.deploy.benchmarks import machine
 from fieldpose.deploy.scene import demo_file
 from fieldpose.errors import WeightsError
 from fieldpose.stages.geometry import Camera, perturb, points_at_depth
-from fieldpose.stages.lifting.core import LiftingConfig, depth_at
+from fieldpose.stages.lifting.core import MAX_DEPTH_STEP, depth_at
 from fieldpose.stages.matching.core import MATCHERS, MatchedPixels, Matcher, MatchingConfig, PairMatcher, build_matcher
 from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.nerf.loading import load_renderer
@@ -127,7 +127,7 @@ def _matched(
 def is_right(pair: Pair, matched: MatchedPixels) -> np.ndarray:
     """Which matches (n,) bool lie within RIGHT_PX of where the view's depth and the true pose place the point."""
     view = pair.view
-    depths = depth_at(view.depth, matched.pixels_a, LiftingConfig().max_depth_step)
+    depths = depth_at(view.depth, matched.pixels_a, MAX_DEPTH_STEP)
     points = points_at_depth(view.camera, view.cam_from_object, matched.pixels_a, depths)
     in_camera = points @ pair.truth[:3, :3].T + pair.truth[:3, 3]
     seen = (depths > 0) & (in_camera[:, 2] > 0)

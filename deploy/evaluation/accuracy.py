@@ -21,6 +21,7 @@ from fieldpose.stages.geometry import (
 from fieldpose.stages.nerf.metadata import PoseAccuracy
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 from fieldpose.stages.nerf.training_views import TrainingViews
+from fieldpose.stages.tracking.config import COVER
 
 _IMAGES = 32
 _ENOUGH = 8
@@ -53,7 +54,7 @@ def pose_accuracy(
     )
     # What is believed of a pose is to be found out here, not taken from what was found out before.
     finder = photo_finder(settings, replace(views, error_scale=1.0), renderer)
-    neighbours = _neighbours(views, Limit(settings.tracking.cover_deg, settings.tracking.cover * views.scale))
+    neighbours = _neighbours(views, COVER.scaled(views.scale))
     chosen = np.unique(np.linspace(0, len(images) - 1, _IMAGES).astype(int))
     turns, shifts, distances = [], [], []
     for i in chosen:

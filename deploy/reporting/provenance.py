@@ -10,10 +10,11 @@ from pathlib import Path
 
 import msgspec
 
+from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.recording import Metadata
 from fieldpose.bus.replay import Attachment, RecordingInfo, read_attachment
 from fieldpose.deploy.plan import Plan
-from fieldpose.deploy.settings import Settings, changed, to_json
+from fieldpose.deploy.settings import Settings, changed, to_json, without_unknown
 from fieldpose.errors import RecordingError
 
 RUN_RECORD, PLAN_RECORD = "fieldpose.run", "fieldpose.plan"
@@ -46,8 +47,14 @@ def attachments(plan: Plan) -> list[Attachment]:
 
 
 def recorded_settings(path: Path) -> Settings:
-    """The settings of a recorded run. Raises RecordingError where the recording has none."""
+    """The settings of a recorded run, without those that this version no longer has, which is said in its log.
+
+    Raises RecordingError where the recording has none.
+    """
     content = msgspec.json.decode(read_attachment(path, SETTINGS_ATTACHMENT))
+    gone = without_unknown(Settings(), content)
+    if gone:
+        stage_logger("replay").warning("settings of another version are left out", names=", ".join(gone))
     return changed(Settings(), content, f"{path}: {SETTINGS_ATTACHMENT}")
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry.errors import rotation_error_deg, translation_error
 from fieldpose.stages.geometry.rigid import camera_centres
 
@@ -16,6 +17,14 @@ class Limit:
 
     angle_deg: float
     distance: float
+
+    def __post_init__(self) -> None:
+        if not (self.angle_deg >= 0 and self.distance >= 0):
+            raise ConfigError(f"a limit of {self.angle_deg:g} degrees and {self.distance:g} must not be negative")
+
+    def scaled(self, scale: float) -> Limit:
+        """The limit whose distance is so many times larger: from shares of a length to object units."""
+        return Limit(self.angle_deg, self.distance * scale)
 
     def distance_ratio(self, a: np.ndarray, b: np.ndarray) -> float:
         """How far apart two poses are in multiples of this limit, the worse of angle and distance."""

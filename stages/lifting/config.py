@@ -26,9 +26,10 @@ class LiftingConfig:
     """but none whose displacement exceeds this multiple of gamma"""
     gamma_unit: Literal["pixel", "field"] = "pixel"
     """pixel: what one pixel of the view covers at the point's depth; field: the field's own length unit"""
-    min_opacity: float = 0.5
-    """a pixel that is more transparent shows no surface"""
-    max_depth_step: float = 0.03
-    """depths of neighbouring pixels that differ by a larger share belong to two surfaces and are not mixed"""
     min_kept: int = 6
     """fewer consistent points than this are reported as a failure"""
+
+MIN_OPACITY = 0.5
+"""A pixel that is more transparent shows no surface."""
+MAX_DEPTH_STEP = 0.03
+"""Depths of neighbouring pixels that differ by a larger share belong to two surfaces and are not mixed."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from fieldpose.bus.messages import Reason
 from fieldpose.stages.geometry import Camera, camera_centre, points_at_depth
-from fieldpose.stages.lifting.config import LiftingConfig
+from fieldpose.stages.lifting.config import MAX_DEPTH_STEP, MIN_OPACITY, LiftingConfig
 from fieldpose.stages.lifting.memory import ConsistencyMemory, Remember
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 
@@ -52,9 +52,9 @@ def lift(
     than the configuration asks for.
     """
     config = config or LiftingConfig()
-    depths = depth_at(depth, pixels_in_view, config.max_depth_step)
+    depths = depth_at(depth, pixels_in_view, MAX_DEPTH_STEP)
     scale = 255.0 if opacity.dtype == np.uint8 else 1.0
-    seen = (depths > 0) & (_nearest(opacity, pixels_in_view) >= config.min_opacity * scale)
+    seen = (depths > 0) & (_nearest(opacity, pixels_in_view) >= MIN_OPACITY * scale)
     depths = np.where(seen, depths, 0).astype(np.float32)
     points = points_at_depth(camera, cam_from_object, pixels_in_view, depths)
     spread = np.full(len(points), _NEVER, np.float32)

@@ -17,6 +17,7 @@ import numpy as np
 
 from fieldpose.stages.geometry import Camera, inverse, unscale_pixels
 from fieldpose.stages.images import shrunk_with_camera
+from fieldpose.stages.pnp import constants
 from fieldpose.stages.pnp.config import PnpConfig
 from fieldpose.stages.pnp.least_squares import intrinsics_of
 from fieldpose.stages.pnp.patches import find_patches
@@ -80,14 +81,14 @@ class Aligner:
 
     def rounds(self) -> Iterator[tuple[int, float]]:
         """Level, and largest error that would not surprise, in pixels of the frame, of each round: coarse to fine."""
-        finest = self._config.align_px / float(self._scale.min())
+        finest = constants.ALIGN_PX / float(self._scale.min())
         for level in range(self._config.align_levels - 1, -1, -1):
             yield level, _LOOSER * finest * 2**level
         yield 0, finest
 
     def place(self, cam_from_object: np.ndarray, level: int, most: int | None = None) -> Placed:
         """Look for the points, or `most` of them, near where a pose puts them; patches are 2^level pixels coarse."""
-        config, smaller = self._config, np.float32(0.5**level)
+        smaller = np.float32(0.5**level)
         width, height, count = self._camera.width, self._camera.height, len(self._pixels)
         starts, warps = np.empty((count, 2), np.float32), np.empty((count, 2, 2), np.float32)
         seen = np.empty(count, bool)
@@ -103,15 +104,15 @@ class Aligner:
         covariance = np.empty((len(index), 2, 2), np.float32)
         find_patches(
             self._view[level], self._frame[level], (self._pixels[index] * smaller).astype(np.float32), warps[index],
-            starts[index] * smaller, config.align_half, config.align_steps, places, similarity, covariance,
+            starts[index] * smaller, constants.ALIGN_HALF, constants.ALIGN_STEPS, places, similarity, covariance,
         )  # fmt: skip
         places /= smaller
         inside = ((places >= 0) & (places <= (width - 1, height - 1))).all(axis=1)
-        found = inside & (similarity > config.align_similarity)
+        found = inside & (similarity > constants.ALIGN_SIMILARITY)
         pixels = unscale_pixels(places[found].astype(np.float64), self._scale)
         # In pixels of the view, of which the frame's are all the same multiple.
         covariance = covariance[found].astype(np.float64) * 4**level
-        return Placed(index[found], pixels, np.linalg.inv(covariance + config.align_floor_px**2 * np.eye(2)), seen)
+        return Placed(index[found], pixels, np.linalg.inv(covariance + constants.ALIGN_FLOOR_PX**2 * np.eye(2)), seen)
 
 
 def inverse_depth_slopes(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:

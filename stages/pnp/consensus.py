@@ -12,6 +12,7 @@ import numpy as np
 import poselib
 
 from fieldpose.stages.geometry import Camera, is_rigid
+from fieldpose.stages.pnp import constants
 from fieldpose.stages.pnp.alignment import Aligner
 from fieldpose.stages.pnp.config import PnpConfig
 from fieldpose.stages.pnp.least_squares import CONVERGED, PoseFit, fit_pose, isotropic, reprojection_errors_px
@@ -100,9 +101,9 @@ def confirmed_pose(
     """
     count = len(pixels_in_frame)
     marks = len(points) - count
-    search = replace(config, min_inlier_ratio=config.min_inlier_ratio * config.unconfirmed_share)
+    search = replace(config, min_inlier_ratio=config.min_inlier_ratio * constants.UNCONFIRMED_SHARE)
     left, best, first, most, needed = np.arange(count), None, None, 0, 0.0
-    for _ in range(config.attempts):
+    for _ in range(constants.ATTEMPTS):
         agreed = agreed_pose(pixels_in_frame[left], points[left], camera, weights[left], search)
         if agreed is None:
             break
@@ -110,17 +111,17 @@ def confirmed_pose(
         agreed = replace(agreed, index=left[agreed.index], matched=count, marks=marks)
         found, most = _aligned(agreed, aligner, points, camera, config), max(most, agreed.of_matched)
         if found is not None and (
-            found.of_matched < _LEAST_ALIGNED * most or found.landmarks < config.min_landmarks * found.marks
+            found.of_matched < _LEAST_ALIGNED * most or found.landmarks < constants.MIN_LANDMARKS * found.marks
         ):
             found = None
-        if found is not None and found.of_matched >= config.min_support * count:
+        if found is not None and found.of_matched >= constants.MIN_SUPPORT * count:
             if best is None or len(found.index) > len(best.index):
                 best = found
-            if found.landmarks >= config.sure_landmarks * found.marks:
+            if found.landmarks >= constants.SURE_LANDMARKS * found.marks:
                 break
             search = replace(search, iterations=min(search.iterations, _FEWER_ITERATIONS))
         elif first is None:
-            first, share = (agreed, config.min_unaligned) if found is None else (found, config.min_inlier_ratio)
+            first, share = (agreed, constants.MIN_UNALIGNED) if found is None else (found, config.min_inlier_ratio)
             needed = share * count
         left = others
     if best is not None:
@@ -147,7 +148,7 @@ def _aligned(
         in_frame = max(int(placed.seen[agreed.matched :].sum()), int(_LEAST_IN_FRAME * agreed.marks))
         found = Consensus(fit, index[inliers], placed.pixels[usable][inliers], agreed.matched, in_frame)
     rms = float(np.sqrt((found.fit.errors[0] ** 2).sum(axis=1).mean()))
-    return found if rms <= config.align_spread * rounds[-1][1] else None
+    return found if rms <= constants.ALIGN_SPREAD * rounds[-1][1] else None
 
 
 def _ransac(
@@ -161,7 +162,7 @@ def _ransac(
     intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
     options = {
         "max_reproj_error": threshold, "max_iterations": config.iterations,
-        "min_iterations": config.least_iterations, "success_prob": config.confidence, "seed": config.seed,
+        "min_iterations": constants.LEAST_ITERATIONS, "success_prob": constants.CONFIDENCE, "seed": config.seed,
     }  # fmt: skip
     found, about = poselib.estimate_absolute_pose(
         pixels, points, {**model, "params": intrinsics}, ransac_opt=options, bundle_opt={"max_iterations": 0}

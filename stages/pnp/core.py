@@ -8,6 +8,7 @@ import numpy as np
 
 from fieldpose.bus.messages import Reason
 from fieldpose.stages.geometry import Camera, camera_centre, twist_covariance, viewing_angles
+from fieldpose.stages.pnp import constants
 from fieldpose.stages.pnp.alignment import Aligner, Pictures
 from fieldpose.stages.pnp.config import PnpConfig
 from fieldpose.stages.pnp.consensus import MIN_POINTS, agreed_pose, confirmed_pose
@@ -58,7 +59,7 @@ def solve(
     if count < max(config.min_inliers, MIN_POINTS):
         return Reason.TOO_FEW_CONSISTENT_POINTS
     points = points_in_object.astype(np.float64)
-    weights = _weights(confidence, count, config)
+    weights = _weights(confidence, count)
     if pictures is None or config.align_levels == 0:
         found = agreed_pose(pixels_in_frame, points, camera, weights, config)
     else:
@@ -70,7 +71,7 @@ def solve(
         return Reason.NO_CONSENSUS
     fit, pose = found.fit, found.fit.cam_from_object
     angles = viewing_angles(points[found.index], pose if seen_from is None else seen_from, pose)
-    shared = config.shared_error + config.shared_error_by_angle * float(np.median(angles))
+    shared = constants.SHARED_ERROR + constants.SHARED_ERROR_BY_ANGLE * float(np.median(angles))
     residuals, jacobian = fit.errors
     covariance = twist_covariance(
         jacobian, fit.weights, found.pixels, longer_side, fit.variance, shared**2 * fit.variance_px
@@ -93,10 +94,10 @@ def warm_up(config: PnpConfig) -> None:
     solve(pixels, points, camera, config, pictures=Pictures(image, depth, camera, np.eye(4), image))
 
 
-def _weights(confidence: np.ndarray | None, count: int, config: PnpConfig) -> np.ndarray:
+def _weights(confidence: np.ndarray | None, count: int) -> np.ndarray:
     if confidence is None:
         return np.ones(count)
-    return np.maximum(confidence.astype(np.float64), _LEAST_CONFIDENCE) ** config.confidence_power
+    return np.maximum(confidence.astype(np.float64), _LEAST_CONFIDENCE) ** constants.CONFIDENCE_POWER
 
 
 def _plausible(
@@ -107,4 +108,4 @@ def _plausible(
     shift = np.sqrt(max(np.trace(covariance[:3, :3]), 0.0))
     turn = np.sqrt(max(np.linalg.eigvalsh(covariance[3:, 3:])[-1], 0.0))
     certain = np.rad2deg(turn) <= config.max_rotation_std_deg and shift <= config.max_translation_std * distance
-    return bool(certain and spread >= config.min_spread * longer_side)
+    return bool(certain and spread >= constants.MIN_SPREAD * longer_side)

@@ -18,8 +18,6 @@ class RefinementConfig:
     """lm: Levenberg-Marquardt on one sample of pixels; adam: the paper's, on a new sample in each step"""
     derivative: Literal["image", "field"] = "image"
     """image: by the frame's slopes, carried along by the surface's motion; field: through the field itself"""
-    blur_px: float = 1.0
-    """standard deviation of the blur under which the frame's slopes are taken; more reaches farther"""
     region: Literal["keypoints", "image"] = "keypoints"
     """where pixels are taken from: around the matched keypoints, or anywhere (wrong where something is in front)"""
     dilations: int = 4
@@ -36,12 +34,6 @@ class RefinementConfig:
     """ignore: where the field is transparent a pixel counts for nothing; compare: the frame has the field's own"""
     outlier: float = 0.2
     """colour differences (0..1) well beyond it are something else than the object, and hardly pull"""
-    learning_rate: float = 3e-3
-    """Adam's, in radians and in shares of the distance to the surface"""
-    converged: float = 2e-5
-    """a step that is smaller, in the same unit, is the last"""
-    shared_error: float = 0.8
-    """how far neighbouring pixels err together, as a multiple of their differences in colour"""
 
     seed: int = 0
     """Of the choice of pixels."""

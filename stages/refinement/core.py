@@ -13,6 +13,7 @@ import numpy as np
 from fieldpose.stages.geometry import Camera, scale_pixels
 from fieldpose.stages.images import shrunk_with_camera
 from fieldpose.stages.nerf.rendering_api import RayRenderer
+from fieldpose.stages.refinement import constants
 from fieldpose.stages.refinement.config import RefinementConfig
 from fieldpose.stages.refinement.optimisers import adam, levenberg_marquardt
 from fieldpose.stages.refinement.photometric import Photometric, keypoint_region
@@ -74,7 +75,7 @@ def refine(
     after = photometric.loss(judge, refined)
     if after >= before:
         return RefinementResult(cam_from_object, False, before, after, steps)
-    covariance = photometric.covariance(judge, refined, camera, config.shared_error)
+    covariance = photometric.covariance(judge, refined, camera, constants.SHARED_ERROR)
     return RefinementResult(refined, True, before, after, steps, covariance)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from fieldpose.stages.geometry import exp_se3
+from fieldpose.stages.refinement import constants
 from fieldpose.stages.refinement.config import RefinementConfig
 from fieldpose.stages.refinement.photometric import Photometric, PixelSample
 
@@ -45,7 +46,7 @@ def levenberg_marquardt(
             pose, here, damping = moved, there, damping * _LESS
         else:
             damping *= _MORE
-        if np.linalg.norm(twist / unit) < config.converged or 0 < gain < _LITTLE_GAIN or damping > _MOST:
+        if np.linalg.norm(twist / unit) < constants.CONVERGED or 0 < gain < _LITTLE_GAIN or damping > _MOST:
             break
     return pose, steps
 
@@ -71,7 +72,7 @@ def adam(
         first = _BETA1 * first + (1 - _BETA1) * gradient
         second = _BETA2 * second + (1 - _BETA2) * gradient**2
         direction = first / (1 - _BETA1**step) / (np.sqrt(second / (1 - _BETA2**step)) + _EPSILON)
-        rate = config.learning_rate * 0.1 ** (step / config.steps)
+        rate = constants.LEARNING_RATE * 0.1 ** (step / config.steps)
         pose = exp_se3(pivot @ (-rate * direction)) @ pose
     return pose, config.steps
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from fieldpose.stages.geometry import Camera, image_jacobian, twist_covariance, twist_gradient
 from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedRays
+from fieldpose.stages.refinement import constants
 from fieldpose.stages.refinement.config import RefinementConfig
 
 _SCHARR_SUM = 32
@@ -53,7 +54,7 @@ class Photometric:
 
     def __init__(self, renderer: RayRenderer, config: RefinementConfig) -> None:
         self._renderer, self._scale2 = renderer, config.outlier**2
-        self._through_field, self._blur_px = config.derivative == "field", config.blur_px
+        self._through_field, self._blur_px = config.derivative == "field", constants.BLUR_PX
         self._channels = np.eye(3, dtype=np.float32) if config.colours == "rgb" else _GREY
 
     def sample(self, image: np.ndarray, camera: Camera, pixels: np.ndarray) -> PixelSample:

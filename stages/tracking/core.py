@@ -12,7 +12,7 @@ import numpy as np
 
 from fieldpose.bus.messages import Reason
 from fieldpose.stages.tracking.certainty import with_camera
-from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.config import DEADLINE_FACTOR, TrackingConfig
 from fieldpose.stages.tracking.motion import NS_PER_MS
 from fieldpose.stages.tracking.policy import (
     Alike,
@@ -102,7 +102,7 @@ class Tracker:
         """How long a pass may take before its frame is given up."""
         if self._latency_ms is None:
             return self._config.max_deadline_ms
-        usual = self._latency_ms * self._config.deadline_factor
+        usual = self._latency_ms * DEADLINE_FACTOR
         return min(max(usual, self._config.min_deadline_ms), self._config.max_deadline_ms)
 
     def on_frame(self, frame: FrameInfo, now_ns: int, missed: int = 0) -> list[Output]:

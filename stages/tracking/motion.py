@@ -22,8 +22,8 @@ class MotionModel:
 
     def __init__(self, config: MotionConfig, scale: float = 1.0) -> None:
         self._config = config
-        self._max_rotation = np.deg2rad(config.max_rotation_deg)
-        self._max_translation = config.max_translation * scale
+        self._max_rotation = np.deg2rad(config.most.angle_deg)
+        self._max_translation = config.most.distance * scale
         self._times_ns: list[int] = []
         self._poses: list[np.ndarray] = []
 

@@ -11,7 +11,7 @@ from fieldpose.bus.messages import GuessReason, Reason, TrackingState
 from fieldpose.stages.geometry import Limit
 from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.tracking.certainty import Certainty
-from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.config import COVER, TrackingConfig
 from fieldpose.stages.tracking.policy import Alike, Attempt, Belief, FrameInfo, Look, PoseGuess, PoseResult, Step
 from fieldpose.stages.tracking.priors import Priors
 from fieldpose.stages.tracking.scoring import believed, score
@@ -47,8 +47,8 @@ class PhotoPolicy:
         self._config, self._views, self._priors, self._start, self._looks = config, views, priors, start, looks
         self._scale = views.scale
         self._certainty = Certainty(views.error_scale, self._scale)
-        self._settled = Limit(config.settled_deg, config.settled * self._scale)
-        self._cover = Limit(config.cover_deg, config.cover * self._scale)
+        self._settled = config.settled.scaled(self._scale)
+        self._cover = COVER.scaled(self._scale)
         self._trials: dict[int, _Trial] = {}
 
     def on_prior(self, frame_id: int, cam_from_object: np.ndarray) -> None:

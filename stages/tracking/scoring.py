@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from fieldpose.stages.geometry import Limit
 from fieldpose.stages.tracking.config import ScoreConfig, TrackingConfig
 from fieldpose.stages.tracking.policy import PoseResult
 
@@ -21,7 +20,8 @@ def score(result: PoseResult, config: ScoreConfig, scale: float = 1.0) -> float:
         measures.append(_share(config.good_residual_px, result.residual_px))
     if result.covariance is not None:
         sigma, sigma_deg = deviations(result.covariance)
-        measures += [_share(config.good_sigma * scale, sigma), _share(config.good_sigma_deg, sigma_deg)]
+        good = config.good_sigma.scaled(scale)
+        measures += [_share(good.distance, sigma), _share(good.angle_deg, sigma_deg)]
     return float(np.clip(min(measures), 0.0, 1.0))
 
 
@@ -34,7 +34,7 @@ def believed(result: PoseResult, guess: np.ndarray, config: TrackingConfig, scal
     quality, pose = score(result, config.score, scale), result.cam_from_object
     if pose is None or quality < config.score.good:
         return False
-    settled = Limit(config.settled_deg, config.settled * scale)
+    settled = config.settled.scaled(scale)
     return quality >= config.score.sure or settled.holds(guess, pose)
 
 

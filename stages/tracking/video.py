@@ -10,7 +10,7 @@ from fieldpose.bus.messages import GuessReason, Reason, TrackingState
 from fieldpose.stages.geometry import Limit
 from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.tracking.certainty import Certainty
-from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.config import COVER, KEYFRAME, KEYFRAMES, TrackingConfig
 from fieldpose.stages.tracking.motion import MotionModel
 from fieldpose.stages.tracking.policy import Alike, Attempt, Belief, FrameInfo, Look, PoseGuess, PoseResult, Step
 from fieldpose.stages.tracking.priors import Priors
@@ -36,12 +36,12 @@ class VideoPolicy:
         scale = self._scale = views.scale
         self._certainty = Certainty(views.error_scale, scale)
         self._config, self._priors, self._start, self._looks = config, priors, start, looks
-        self._settled = Limit(config.settled_deg, config.settled * scale)
-        self._far = Limit(config.far_deg, config.far * scale)
+        self._settled = config.settled.scaled(scale)
+        self._far = config.far.scaled(scale)
         self._motion = MotionModel(config.motion, scale)
-        self._keyframes = Keyframes(Limit(config.keyframe_deg, config.keyframe * scale), config.keyframes)
+        self._keyframes = Keyframes(KEYFRAME.scaled(scale), KEYFRAMES)
         near = () if start is None else (start,)
-        self._relocaliser = Relocaliser(views, Limit(config.cover_deg, config.cover * scale), near)
+        self._relocaliser = Relocaliser(views, COVER.scaled(scale), near)
         patience = self._relocaliser.lap if start is None else config.lost_after
         self._trust = Trust(config.lost_after, config.weak_after, patience)
         self._guesses = 0
@@ -147,8 +147,8 @@ class VideoPolicy:
     def _reach(self, between_ns: int) -> Limit:
         """How far a camera may be, after that time, from where it was expected."""
         config, seconds = self._config, abs(between_ns) * 1e-9
-        distance = (config.jump + config.jump_per_s * seconds) * self._scale
-        return Limit(config.jump_deg + config.jump_deg_per_s * seconds, distance)
+        angle_deg = config.jump.angle_deg + config.jump_per_s.angle_deg * seconds
+        return Limit(angle_deg, config.jump.distance + config.jump_per_s.distance * seconds).scaled(self._scale)
 
     def _accept(self, guess: PoseGuess, capture_ns: int, pose: np.ndarray, result: PoseResult, begins: bool) -> Belief:
         quality, was_tracked = self._quality(result), self._trust.tracked

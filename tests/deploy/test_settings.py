@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fieldpose.deploy.settings import Settings, changed, read_file, read_settings, to_json
+from fieldpose.deploy.settings import Settings, changed, read_file, read_settings, to_json, without_unknown
 from fieldpose.errors import ConfigError
 
 
@@ -76,3 +76,9 @@ def test_files_that_are_not_there_or_hold_no_table_are_told(tmp_path: Path) -> N
         read_file(written(tmp_path / "a.json", "[1]"))
     with pytest.raises(ConfigError, match="not a JSON file"):
         read_file(written(tmp_path / "b.json", "{"))
+
+
+def test_what_a_version_no_longer_has_is_left_out_and_named() -> None:
+    content = {"tracking": {"settled_deg": 2.0, "depth": 3, "motion": {"inertia": 1}}, "smoothing": {}}
+    assert without_unknown(Settings(), content) == ["smoothing", "tracking.settled_deg", "tracking.motion.inertia"]
+    assert changed(Settings(), content, "test").tracking.depth == 3

@@ -1,6 +1,5 @@
 """Looking for lifted points in the frame, on a scene whose geometry is known exactly."""
 
-
 import cv2
 import msgspec
 import numpy as np
@@ -11,6 +10,7 @@ from fieldpose.bus.messages import Reason
 from fieldpose.errors import GeometryError
 from fieldpose.stages.geometry import Camera, exp_se3, perturb, rays, rotation_error_deg, translation_error
 from fieldpose.stages.nerf.rendering_api import RenderedView
+from fieldpose.stages.pnp import constants
 from fieldpose.stages.pnp.alignment import Aligner, Pictures, Placed, inverse_depth_slopes
 from fieldpose.stages.pnp.core import PnpConfig, PnpResult, solve
 
@@ -74,9 +74,7 @@ def pose_of(result: PnpResult | Reason) -> np.ndarray:
     return solved(result).cam_from_object
 
 
-def test_points_are_found_where_they_are(
-    view: RenderedView, frame: np.ndarray, points: np.ndarray
-) -> None:
+def test_points_are_found_where_they_are(view: RenderedView, frame: np.ndarray, points: np.ndarray) -> None:
     aligner = Aligner(pictures(view, frame), points, LENS, PnpConfig())
     placed = aligner.place(exp_se3([0.01, -0.005, 0.01, 0.002, -0.003, 0.002]) @ TRUTH, 0)
     errors = np.linalg.norm(placed.pixels - in_frame(points)[placed.index], axis=1)
@@ -117,14 +115,19 @@ def test_a_wrong_pose_is_told_by_how_little_is_found(
     agreed = solved(solve(pixels, points, LENS, PnpConfig(align_levels=0), pictures=pictures(view, elsewhere)))
     assert agreed.inliers.mean() > 0.8
     placed = Aligner(pictures(view, elsewhere), points, LENS, PnpConfig()).place(pose_of(agreed), 0)
-    assert len(placed.index) < PnpConfig().min_support * len(points)
+    assert len(placed.index) < constants.MIN_SUPPORT * len(points)
 
 
 def test_few_matches_give_a_pose_only_if_points_are_found_where_it_puts_them(
-    scene: AnalyticScene, view: RenderedView, frame: np.ndarray, points: np.ndarray
+    scene: AnalyticScene,
+    view: RenderedView,
+    frame: np.ndarray,
+    points: np.ndarray,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """One in seventeen matches is right, which is too few to believe without seeing."""
-    pixels, config = matched(points, 0.94, 0.4, seed=3), PnpConfig(least_iterations=50_000, iterations=50_000)
+    monkeypatch.setattr(constants, "LEAST_ITERATIONS", 50_000)
+    pixels, config = matched(points, 0.94, 0.4, seed=3), PnpConfig(iterations=50_000)
     assert isinstance(solve(pixels, points, LENS, config), Reason)
     seen = solved(solve(pixels, points, LENS, config, pictures=pictures(view, frame)))
     assert rotation_error_deg(pose_of(seen), TRUTH) < 0.3
@@ -166,7 +169,10 @@ def test_landmarks_hold_a_pose_that_is_matched_in_one_place_only(
 
 
 def test_parts_that_look_alike_are_told_apart_by_landmarks(
-    view: RenderedView, frame: np.ndarray, points: np.ndarray
+    view: RenderedView,
+    frame: np.ndarray,
+    points: np.ndarray,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The box's top is there twice, and more matches agree on the wrong one, where their patches are found."""
     wrong = exp_se3([0.35, 0.1, 0, 0, 0, 0]) @ TRUTH
@@ -178,14 +184,19 @@ def test_parts_that_look_alike_are_told_apart_by_landmarks(
     pixels = np.random.default_rng(1).uniform(0, 259, here.shape).astype(np.float32)
     pixels[top], pixels[right] = there[top], here[right]
     given = pictures(view, doubled)
-    hasty = solved(solve(pixels, points, LENS, PnpConfig(sure_landmarks=0.0), pictures=given))
+    with monkeypatch.context() as patched:
+        patched.setattr(constants, "SURE_LANDMARKS", 0.0)
+        hasty = solved(solve(pixels, points, LENS, pictures=given))
     assert rotation_error_deg(pose_of(hasty), wrong) < 1
     assert translation_error(pose_of(hasty), wrong) < 0.05
     assert translation_error(pose_of(solve(pixels, points, LENS, pictures=given)), TRUTH) < 0.01
 
 
 def test_no_pose_is_borne_out_where_too_few_landmarks_are_found(
-    view: RenderedView, frame: np.ndarray, points: np.ndarray
+    view: RenderedView,
+    frame: np.ndarray,
+    points: np.ndarray,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """All of the frame but the box's top is covered, and few matches are right: those there."""
     here = in_frame(points)
@@ -194,9 +205,10 @@ def test_no_pose_is_borne_out_where_too_few_landmarks_are_found(
     covered[int(here[top, 1].max()) + 9 :] = 128
     pixels = np.random.default_rng(2).uniform(0, 259, here.shape).astype(np.float32)
     pixels[top] = here[top]
-    given, many = pictures(view, covered), PnpConfig(min_landmarks=0.6)
+    given = pictures(view, covered)
     assert translation_error(pose_of(solve(pixels, points, LENS, pictures=given)), TRUTH) < 0.01
-    assert isinstance(solve(pixels, points, LENS, many, pictures=given), Reason)
+    monkeypatch.setattr(constants, "MIN_LANDMARKS", 0.6)
+    assert isinstance(solve(pixels, points, LENS, pictures=given), Reason)
 
 
 @pytest.mark.parametrize("frame_shade", [0, 255])
@@ -210,13 +222,16 @@ def test_a_frame_without_anything_leaves_the_pose_of_the_matches(
     assert np.array_equal(looked.inliers, plain.inliers)
 
 
-def test_few_matches_that_no_search_bears_out_are_not_believed(view: RenderedView, points: np.ndarray) -> None:
+def test_few_matches_that_no_search_bears_out_are_not_believed(
+    view: RenderedView, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A fifth of the matches agrees, which is enough by itself, but nothing of the view is seen in the frame."""
     blank, pixels = np.full((260, 260, 3), 128, np.uint8), matched(points, 0.8, 0.5)
     solved(solve(pixels, points, LENS))
     given = pictures(view, blank)
     assert solve(pixels, points, LENS, pictures=given) is Reason.NO_CONSENSUS
-    solved(solve(pixels, points, LENS, PnpConfig(min_unaligned=0.1), pictures=given))
+    monkeypatch.setattr(constants, "MIN_UNALIGNED", 0.1)
+    solved(solve(pixels, points, LENS, pictures=given))
 
 
 @pytest.mark.parametrize(("radius_px", "believed"), [(0.9, True), (2.2, False)])
@@ -247,9 +262,12 @@ def test_a_blurred_frame_is_better_known_by_its_matches(
     assert rotation_error_deg(pose_of(result), TRUTH) < 0.5
 
 
-def test_nothing_is_found_beyond_the_frame(view: RenderedView, frame: np.ndarray, points: np.ndarray) -> None:
+def test_nothing_is_found_beyond_the_frame(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A camera turned so that many points are at its image's border."""
-    aligner = Aligner(pictures(view, frame), points, LENS, PnpConfig(align_similarity=-1.0))
+    monkeypatch.setattr(constants, "ALIGN_SIMILARITY", -1.0)
+    aligner = Aligner(pictures(view, frame), points, LENS, PnpConfig())
     for angle in (0.2, 0.25, 0.3):
         placed = aligner.place(exp_se3([0, 0, 0, 0, angle, 0]) @ TRUTH, 2)
         assert len(placed.index) > 10

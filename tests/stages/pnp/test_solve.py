@@ -9,6 +9,7 @@ from scipy import stats
 from fieldpose.bus.messages import Reason
 from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry import Camera, exp_se3, inverse, log_se3, look_at, rotation_error_deg, translation_error
+from fieldpose.stages.pnp import constants
 from fieldpose.stages.pnp.core import PnpConfig, PnpResult, solve
 from fieldpose.stages.pnp.least_squares import (
     exp_se3_times,
@@ -70,7 +71,7 @@ def test_the_same_input_gives_the_same_result() -> None:
 
 
 @pytest.mark.parametrize(("noise_px", "shared"), [(0.3, 0.0), (1.2, 0.0), (0.6, 0.7), (0.6, 1.5)])
-def test_the_covariance_is_that_of_the_error(noise_px: float, shared: float) -> None:
+def test_the_covariance_is_that_of_the_error(noise_px: float, shared: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """xi^T C^-1 xi is chi-square with 6 degrees of freedom; the mean of 150 lies within 0.6 of 6 by 2 sigma.
 
     Shared errors count twice, in the residuals and by themselves, but for what the fit takes up: wider limits.
@@ -83,7 +84,8 @@ def test_the_covariance_is_that_of_the_error(noise_px: float, shared: float) -> 
         column, row = np.clip(pixels // 50, 0, 7).astype(int).T
         pixels = pixels + offsets[row, column].astype(np.float32)
         own = shared / np.hypot(1, shared)  # residuals tell the sum of both errors
-        result = solved(solve(pixels, points, CAMERA, PnpConfig(threshold_px=20.0, shared_error=own)))
+        monkeypatch.setattr(constants, "SHARED_ERROR", own)
+        result = solved(solve(pixels, points, CAMERA, PnpConfig(threshold_px=20.0)))
         twist = log_se3(solved(result).cam_from_object @ inverse(POSE))
         assert result.covariance is not None
         distances.append(twist @ np.linalg.solve(result.covariance, twist))
@@ -112,13 +114,13 @@ def test_a_pose_is_none_that_its_inliers_leave_uncertain() -> None:
     assert refused is Reason.IMPLAUSIBLE_POSE
 
 
-@pytest.mark.parametrize("setting", [{"align_half": 0}, {"align_levels": -1}, {"landmarks": -1}, {"attempts": 0}])
+@pytest.mark.parametrize("setting", [{"align_levels": -1}, {"landmarks": -1}, {"iterations": 0}])
 def test_settings_that_mean_nothing_are_refused(setting: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=r"pnp: \w+ is -?\d, but must be at least \d"):
         PnpConfig(**setting)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("setting", [{"min_support": -0.1}, {"sure_landmarks": 30.0}, {"min_landmarks": 1.01}])
+@pytest.mark.parametrize("setting", [{"min_inlier_ratio": -0.1}, {"min_inlier_ratio": 30.0}])
 def test_shares_that_are_none_are_refused(setting: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=r"pnp: \w+ is -?[\d.]+, but is a share, from 0 to 1"):
         PnpConfig(**setting)  # type: ignore[arg-type]

@@ -9,6 +9,7 @@ import pytest
 from support.tracking_world import World, hand_held, most_alike, on_sphere, ring_of_views
 
 from fieldpose.bus.messages import CameraOrigin, GuessReason, TrackingState
+from fieldpose.stages.geometry import Limit
 from fieldpose.stages.tracking.config import TrackingConfig
 from fieldpose.stages.tracking.core import Tracker
 from fieldpose.stages.tracking.photos import PhotoPolicy
@@ -121,7 +122,7 @@ def test_recovers_when_the_camera_is_carried_elsewhere_at_once(looks: bool, foun
 
 
 def test_a_cut_to_a_near_place_is_believed_by_the_second_frame() -> None:
-    tracker = following(on_sphere(0, 30), jump_deg_per_s=60.0)
+    tracker = following(on_sphere(0, 30), jump_per_s=Limit(60, 1))
     world = World(tracker, lambda t: on_sphere(0 if t < 2 else 33, 30)).run(4)
     after = world.states(2)
     assert after[0] is LIMITED

@@ -113,7 +113,7 @@ def test_a_result_past_its_deadline_frees_the_place_and_is_counted_lost() -> Non
 
 
 def test_the_deadline_follows_the_usual_latency_between_its_limits() -> None:
-    door = tracker(depth=1, min_deadline_ms=500, max_deadline_ms=8000, deadline_factor=10)
+    door = tracker(depth=1, min_deadline_ms=500, max_deadline_ms=8000)
     assert door.deadline_ms == 8000
     for i in range(40):
         door.on_frame(frame(i), i * MS)
@@ -126,7 +126,7 @@ def test_the_deadline_follows_the_usual_latency_between_its_limits() -> None:
 
 
 def test_a_pipeline_that_becomes_slow_is_not_late_for_ever() -> None:
-    door = tracker(depth=1, min_deadline_ms=200, max_deadline_ms=10_000, deadline_factor=10)
+    door = tracker(depth=1, min_deadline_ms=200, max_deadline_ms=10_000)
     now_ns = 0
     for i, latency_ms in enumerate([20] * 20 + [3000] * 40):
         door.on_frame(frame(i), now_ns)
@@ -249,7 +249,7 @@ def test_a_frame_that_nothing_looks_like_ends_with_that_reason_and_frees_its_pla
 
 
 def test_looks_say_nothing_about_how_long_a_pass_takes() -> None:
-    door = tracker(looks=(0,), depth=1, min_deadline_ms=1, max_deadline_ms=8000, deadline_factor=10)
+    door = tracker(looks=(0,), depth=1, min_deadline_ms=1, max_deadline_ms=8000)
     door.on_frame(frame(0), 0)
     door.on_alike(0, SOMETHING, 700 * MS)
     door.on_result(done(0), 720 * MS)
@@ -308,7 +308,15 @@ def test_every_frame_is_accounted_for_whatever_happens(
         assert len(ended) == len(set(ended)) >= counts.finished + counts.lost
 
 
-@pytest.mark.parametrize("wrong", [{"depth": 0}, {"passes": 0}, {"retries": -1}, {"jump_deg": -1.0}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"depth": 0},
+        {"passes": 0},
+        {"retries": -1},
+        {"guess_wait_ms": -1.0},
+    ],
+)
 def test_settings_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         TrackingConfig(**wrong)  # type: ignore[arg-type]

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldpose.stages.geometry import exp_se3, inverse, log_se3
+from fieldpose.stages.geometry import Limit, exp_se3, inverse, log_se3
 from fieldpose.stages.tracking.config import MotionConfig
 from fieldpose.stages.tracking.motion import MotionModel
 
 SECOND = 1_000_000_000
-UNDAMPED = MotionConfig(damping_ms=float("inf"), max_rotation_deg=180, max_translation=100, horizon_ms=1e6)
+UNDAMPED = MotionConfig(damping_ms=float("inf"), most=Limit(180, 100), horizon_ms=1e6)
 small = st.floats(-1.0, 1.0, allow_nan=False)
 twists = st.tuples(*[small] * 6)
 
@@ -66,11 +66,11 @@ def test_damping_follows_short_motions_and_stops_long_ones() -> None:
 
 
 def test_predictions_are_clamped_without_changing_their_direction() -> None:
-    fast = two_poses(MotionConfig(max_rotation_deg=10, max_translation=50), twist=(1, 2, 0, 0, 0, 5))
+    fast = two_poses(MotionConfig(most=Limit(10, 50)), twist=(1, 2, 0, 0, 0, 5))
     turned = ahead(fast, 900)
     assert np.rad2deg(np.linalg.norm(turned[3:])) == pytest.approx(10)
     np.testing.assert_allclose(turned / np.linalg.norm(turned), np.array([1, 2, 0, 0, 0, 5]) / np.sqrt(30), atol=1e-9)
-    shifted = ahead(two_poses(MotionConfig(max_translation=0.1), scale=0.5, twist=(3, 0, 0, 0, 0, 0)), 900)
+    shifted = ahead(two_poses(MotionConfig(most=Limit(20, 0.1)), scale=0.5, twist=(3, 0, 0, 0, 0, 0)), 900)
     assert shifted[0] == pytest.approx(0.05)
 
 

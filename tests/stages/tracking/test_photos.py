@@ -9,7 +9,7 @@ import pytest
 from support.tracking_world import frame_info, on_sphere, ring_of_views
 
 from fieldpose.bus.messages import GuessReason, Reason, TrackingState
-from fieldpose.stages.geometry import Limit
+from fieldpose.stages.tracking.config import COVER as COVER_BY_SCALE
 from fieldpose.stages.tracking.config import TrackingConfig
 from fieldpose.stages.tracking.photos import PhotoPolicy
 from fieldpose.stages.tracking.policy import Alike, Attempt, Belief, Look, PoseGuess, PoseResult, Step
@@ -19,7 +19,7 @@ from fieldpose.stages.tracking.search import farthest_point_order
 VIEWS = ring_of_views()
 FRAME = frame_info(7)
 PRIOR = on_sphere(0, 30)
-COVER = Limit(TrackingConfig().cover_deg, TrackingConfig().cover * VIEWS.scale)
+COVER = COVER_BY_SCALE.scaled(VIEWS.scale)
 NOWHERE = Alike(reason=Reason.NOT_AVAILABLE)
 
 

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldpose.bus.messages import TrackingState
+from fieldpose.stages.geometry import Limit
 from fieldpose.stages.tracking.config import ScoreConfig
 from fieldpose.stages.tracking.policy import PoseResult
 from fieldpose.stages.tracking.scoring import deviations, score
@@ -107,7 +108,7 @@ def test_score_is_one_for_a_good_pose_and_zero_for_none() -> None:
     ],
 )
 def test_score_is_that_of_the_weakest_measure(worse: dict, expected: float) -> None:
-    config = ScoreConfig(good_inliers=40, good_inlier_ratio=0.4, good_residual_px=2, good_sigma=0.02, good_sigma_deg=1)
+    config = ScoreConfig(good_inliers=40, good_inlier_ratio=0.4, good_residual_px=2, good_sigma=Limit(1.0, 0.02))
     assert score(replace(GOOD, **worse), config) == pytest.approx(expected)
 
 

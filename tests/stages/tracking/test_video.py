@@ -10,7 +10,7 @@ from support.tracking_world import MS, frame_info, on_sphere, ring_of_views
 
 from fieldpose.bus.messages import GuessReason, Reason, TrackingState
 from fieldpose.errors import ConfigError
-from fieldpose.stages.geometry import rotation_error_deg
+from fieldpose.stages.geometry import Limit, rotation_error_deg
 from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.tracking.config import TrackingConfig
 from fieldpose.stages.tracking.policy import Alike, Attempt, Belief, FrameInfo, Look, PoseGuess, PoseResult, Step
@@ -136,7 +136,7 @@ def test_a_frame_whose_prior_is_awaited_has_no_step_without_it() -> None:
 
 
 def test_a_jump_waits_for_a_second_frame_and_then_begins_a_new_motion() -> None:
-    camera = tracking(jump_deg_per_s=10)
+    camera = tracking(jump_per_s=Limit(10, 1))
     first = camera.see(on_sphere(60, 30))
     assert first.state is TrackingState.LIMITED
     assert first.reason is Reason.IMPLAUSIBLE_POSE
@@ -150,14 +150,14 @@ def test_a_jump_waits_for_a_second_frame_and_then_begins_a_new_motion() -> None:
 
 
 def test_two_jumps_to_different_places_confirm_nothing() -> None:
-    camera = tracking(jump_deg_per_s=10)
+    camera = tracking(jump_per_s=Limit(10, 1))
     assert camera.see(on_sphere(60, 30)).state is TrackingState.LIMITED
     assert camera.see(on_sphere(120, 30)).state is TrackingState.LIMITED
     assert camera.see(on_sphere(12, 30)).state is TrackingState.TRACKING
 
 
 def test_a_jump_is_forgotten_once_the_track_goes_on() -> None:
-    camera = tracking(jump_deg_per_s=10)
+    camera = tracking(jump_per_s=Limit(10, 1))
     camera.see(on_sphere(60, 30))
     assert camera.see(on_sphere(11, 30)).state is TrackingState.TRACKING
     assert camera.see(on_sphere(60, 30)).state is TrackingState.LIMITED

@@ -18,7 +18,7 @@ help:
 	@echo "make demo      the embedded scene through the whole pipeline; writes out/demo"
 	@echo "make test      lint, types, architecture, tests"
 	@echo "make lint      only the first three"
-	@echo "make bench     how fast rendering, training, matching and the bus are here; half an hour, writes out/bench"
+	@echo "make bench     how fast rendering, training, matching, bus and tracking are here; 40 minutes; out/bench"
 
 install: $(INSTALLED)
 
@@ -49,6 +49,7 @@ bench: $(INSTALLED)
 	$(BIN)/fieldpose bench render --json out/bench/render.json
 	$(BIN)/fieldpose bench match --json out/bench/match.json
 	$(BIN)/fieldpose bench bus --json out/bench/bus.json
+	$(BIN)/fieldpose bench track --json out/bench/track.json
 
 clean:
 	rm -rf out build *.egg-info .pytest_cache .hypothesis .mypy_cache .ruff_cache .import_linter_cache

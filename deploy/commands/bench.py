@@ -7,12 +7,12 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
-from rich.table import Table
 
-from fieldpose.deploy.reporting.output import check_writable, progress_console, result_console, write_json
+from fieldpose.deploy.benchmarks import tables
+from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
 from fieldpose.deploy.scene import demo_file
 from fieldpose.errors import UsageError
 from fieldpose.stages.nerf.config import FieldConfig
@@ -57,7 +57,7 @@ class Render:
             figures = render.measure(path, dataset, self.sizes, self.views, _into(status.update, "bench render"))
         render.plot(figures, self.out / "render.png")
         write_json(self.json, figures)
-        _print_render(figures)
+        tables.print_render(figures)
         print(f"written: {self.out / 'render.png'}")
         return 0
 
@@ -98,7 +98,7 @@ class Train:
             )
         train.plot(figures, self.out / "train.png")
         write_json(self.json, figures)
-        _print_train(figures)
+        tables.print_train(figures)
         print(f"written: {self.out / 'train.png'}")
         return 0
 
@@ -134,7 +134,7 @@ class Match:
             report = _into(status.update, "bench match")
             figures = match.measure(self.matchers, self.sizes, self.pairs, self.threads, report)
         write_json(self.json, figures)
-        _print_match(figures)
+        tables.print_match(figures)
         return 0
 
 
@@ -177,7 +177,40 @@ class Bus:
         report = _into(progress_console().print, "bench bus")
         figures = bus.measure(self.payloads, self.trips, self.flow_mb, sizes, self.frames, report)
         write_json(self.json, figures)
-        _print_bus(figures)
+        tables.print_bus(figures)
+        return 0
+
+
+@dataclass(frozen=True)
+class Track:
+    """Following a camera: the demo's sequence, live through the real processes, and in one process, frame by frame.
+
+    Example: fieldpose bench track --json out/bench/track.json
+
+    Mode default is what `fieldpose demo` does; in mode full every frame has all its passes, each of them refined, from
+    views of 400 pixels. The JSON file has: machine, modes (mode -> the keys of `fieldpose run`, and share_of_frames
+    (frames with a pose, of those sent), bus_share (of a frame's time from camera to state, the share in which no
+    process was at work for it: transport, decoding, waiting), cpu_by_process (seconds, its start included),
+    rss_mb_by_process, plain_loop_rate_hz (in one process)), plain_loop_rate_hz (mode full's).
+    """
+
+    frames: int | None = None
+    """Only so many, from the start of the sequence (default: all 300)."""
+    modes: tuple[str, ...] = ("full", "default")
+    """Both, or one of them."""
+    json: Path | None = None
+
+    def run(self) -> int:
+        """Measure, print."""
+        check_writable(self.json)
+        if (self.frames is not None and self.frames < 1) or not self.modes:
+            raise UsageError("bench track: at least one frame and one mode are needed")
+        from fieldpose.deploy.benchmarks import track
+
+        # No display that moves: it would take time from the processes.
+        figures = track.measure(self.modes, self.frames, _into(progress_console().print, "bench track"))
+        write_json(self.json, figures)
+        tables.print_track(figures)
         return 0
 
 
@@ -193,6 +226,7 @@ class Options:
         | Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Match, tyro.conf.subcommand("match")]
         | Annotated[Bus, tyro.conf.subcommand("bus")]
+        | Annotated[Track, tyro.conf.subcommand("track")]
     ]
 
     def run(self) -> int:
@@ -218,126 +252,3 @@ def _size(text: str) -> tuple[int, int]:
 
 def _into(update: Callable[[str], None], title: str) -> Callable[[str], None]:
     return lambda text: update(f"{title}: {text}")
-
-
-def _print_render(figures: dict[str, Any]) -> None:
-    console = result_console()
-    table = Table(title=f"a view of {figures['field']['file']}", title_justify="left")
-    names = ("pixels", "ms", "twin, ms", "times faster", "loss, dB", "samples", "M samples/s", "of the limit")
-    for name in names:
-        table.add_column(name, justify="right")
-    for size, row in figures["sizes"].items():
-        table.add_row(
-            size,
-            f"{row['ms_per_view']:.1f}",
-            f"{row['twin_ms_per_view']:.0f}",
-            f"{row['speedup']:.0f}",
-            f"{row['psnr_loss_db']:.2f}",
-            f"{row['samples']:.0f}",
-            f"{row['samples_per_s'] / 1e6:.1f}",
-            f"{row['fraction_of_limit']:.0%}",
-        )
-    console.print(table)
-    limits = figures["limits"]
-    console.print(
-        f"{figures['machine']}: {2 * limits['multiply_adds_per_s'] / 1e9:.0f} GFLOP/s in small matrix products, "
-        f"{limits['reads_per_s'] / 1e6:.0f} M random reads/s; highest memory of a rendering process "
-        f"{figures['rss_mb']:.0f} MB",
-        highlight=False,
-    )
-    rays, many = figures["rays"], figures["rays"]["scattered_samples_per_s"] / 1e6
-    console.print(f"{rays['scattered']} scattered rays: {many:.1f} M samples/s", highlight=False)
-    console.print(
-        f"colours and derivatives of 512 rays, 40 times: {rays['refinement_ms']:.0f} ms; "
-        f"two views: {rays['two_views_ms']:.0f} ms",
-        highlight=False,
-    )
-
-
-def _print_train(figures: dict[str, Any]) -> None:
-    console = result_console()
-    seconds = sorted({float(s) for scores in figures["psnr_db"].values() for s in scores})
-    console.print("PSNR on held-out views (dB) after so many seconds of training:")
-    table = Table()
-    table.add_column("dataset")
-    for second in seconds:
-        table.add_column(f"{second:g}", justify="right")
-    for name, scores in figures["psnr_db"].items():
-        table.add_row(name, *(f"{scores[f'{s:g}']:.2f}" if f"{s:g}" in scores else "" for s in seconds))
-    console.print(table)
-    console.print(
-        f"{figures['machine']}: {figures['samples_per_s'] / 1e6:.2f} M samples/s, the plain twin "
-        f"{figures['twin_samples_per_s'] / 1e6:.3f} M, {figures['speedup']:.1f} times faster; highest memory "
-        f"{figures['rss_mb']:.0f} MB",
-        highlight=False,
-    )
-    for name, error in figures["depth_error"].items():
-        console.print(
-            f"{name}: error of depth within the object {error['median']:.2%} (median), {error['p90']:.2%} (90 %)",
-            highlight=False,
-        )
-
-
-def _print_match(figures: dict[str, Any]) -> None:
-    console = result_console()
-    table = Table(title=f"{figures['pairs']} pairs of a view and an image of the demo scene", title_justify="left")
-    for name in ("pixels", "matcher", "both new, ms", "view known, ms", "matches", "right"):
-        table.add_column(name, justify="left" if name == "matcher" else "right")
-    for size, rows in figures["sizes"].items():
-        for name, row in rows.items():
-            table.add_row(
-                size,
-                name,
-                f"{row['ms_per_pair']:.1f}",
-                f"{row['ms_view_known']:.1f}",
-                f"{row['matches']:.0f}",
-                f"{row['share_right']:.1%}",
-            )
-    console.print(table)
-    console.print(
-        f"{figures['machine']}, {figures['threads']} threads; right: within {figures['right_px']:g} pixels",
-        highlight=False,
-    )
-    for name, reason in figures["missing"].items():
-        console.print(f"{name} is left out: {reason}", highlight=False, markup=False)
-
-
-def _print_bus(figures: dict[str, Any]) -> None:
-    console = result_console()
-    messages = Table(title="messages between two processes; ms at 50, 90 and 99 %", title_justify="left")
-    for name in ("bytes", "one way", "there and back", "lost", "messages/s", "MB/s", "lost", "encode", "decode"):
-        messages.add_column(name, justify="right")
-    for size, row in figures["payloads"].items():
-        messages.add_row(
-            size,
-            _three(row["one_way_ms"]),
-            _three(row["round_trip_ms"]),
-            f"{row['lost']:.1%}",
-            f"{row['messages_per_s']:.0f}",
-            f"{row['mb_per_s']:.0f}",
-            f"{row['lost_in_flow']:.1%}",
-            f"{row['encode_ms']:.3f}",
-            f"{row['decode_ms']:.3f}",
-        )
-    console.print(messages)
-    title = f"a frame to {figures['receivers']} processes; ms of CPU in all, and ms until the pixels are there"
-    frames = Table(title=title, title_justify="left")
-    for name in ("size", "kB", "decode once", "as JPEG", "until", "as pixels", "until", "pixels save"):
-        frames.add_column(name, justify="right")
-    for size, row in figures["frames"].items():
-        frames.add_row(
-            size,
-            f"{row['jpeg_bytes'] / 1e3:.0f}",
-            f"{row['decode_jpeg_ms_cpu']:.2f}",
-            f"{row['jpeg_ms_cpu']:.2f}",
-            f"{row['jpeg_ms_to_pixels']:.2f}",
-            f"{row['rgb8_ms_cpu']:.2f}",
-            f"{row['rgb8_ms_to_pixels']:.2f}",
-            f"{row['jpeg_ms_cpu'] - row['rgb8_ms_cpu']:.2f}",
-        )
-    console.print(frames)
-    console.print(f"{figures['machine']}; JPEG of quality {figures['jpeg_quality']}", highlight=False)
-
-
-def _three(percentiles: dict[str, float | None]) -> str:
-    return "  ".join("-" if ms is None else f"{ms:.2f}" for ms in percentiles.values())

@@ -15,7 +15,7 @@ import tyro
 from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.node import Handler, run_node
 from fieldpose.bus.transport import LOCAL_HUB, ZenohBus, log_to_stderr, serve_hub, wait_for
-from fieldpose.deploy.graph import BY_NAME, CAMERA, GRAPH, Launch, Process, thread_environment, threads_of
+from fieldpose.deploy.graph import BY_NAME, CAMERA, GRAPH, STAGES, Launch, Process, thread_environment, threads_of
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan, resolve
 from fieldpose.deploy.processes.endpoints import peer_address
@@ -94,11 +94,13 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     def wait_until_ready() -> None:
         wait_for(bus, address, options.wait_for, _START_S)
 
+    # The camera waits for the stages once it is at work; those that listen are to get its very first message.
+    first = options.wait_for if row.name != CAMERA else [name for name in options.wait_for if name not in STAGES]
+
     try:
         handler = make(parts, Launch(bus, options.record, wait_until_ready))
         bus.wait_for_hub(_START_S)
-        if row.name != CAMERA:
-            wait_until_ready()
+        wait_for(bus, address, first, _START_S)
         run_node(handler, bus, address)
     finally:
         bus.close()

@@ -62,7 +62,8 @@ class TruthKnown:
 class FrameResult:
     """What became of a frame; `cam_from_object` is the pose measured, None where none was.
 
-    covariance: (6, 6) of the pose's left twist, where it is known.
+    covariance: (6, 6) of the pose's left twist, where it is known. stage_ms, answers: how long each process took for
+    the frame, and how often it has said something of it, all passes together.
     """
 
     frame_id: int
@@ -79,6 +80,7 @@ class FrameResult:
     sent_ns: int | None = None
     answered_ns: int | None = None
     stage_ms: Mapping[str, float] = field(default_factory=dict)
+    answers: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def true_pose(self) -> np.ndarray | None:

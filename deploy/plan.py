@@ -93,29 +93,33 @@ def _looks(settings: Settings, views: TrainingViews | None, begins: Beginning, n
 
 
 def _camera(config: CameraConfig, notes: dict[str, str]) -> CameraConfig:
-    if config.pace != "auto" or not config.source:
-        return config
-    pace: Literal["live", "lockstep"] = "live" if is_video(config.source) else "lockstep"
-    notes["pace"] = f"{pace} (auto)"
-    return replace(config, pace=pace)
+    if config.pace == "auto" and config.source:
+        pace: Literal["live", "lockstep"] = "live" if is_video(config.source) else "lockstep"
+        notes["pace"] = f"{pace} (auto)"
+        return replace(config, pace=pace)
+    notes["pace"] = config.pace
+    return config
 
 
 def _rendering(
     config: RenderingConfig, sequence: Sequence, independent: bool, notes: dict[str, str]
 ) -> RenderingConfig:
-    if config.size == 0:
-        size = VIDEO_VIEW_SIZE if sequence == "video" else PHOTO_VIEW_SIZE
-        config, notes["view size"] = replace(config, size=size), f"{size} (auto: {sequence})"
-    if config.reuse_angle_deg is None:
+    size, angle_deg = config.size, config.reuse_angle_deg
+    why_size = why_angle = ""
+    if size == 0:
+        size, why_size = VIDEO_VIEW_SIZE if sequence == "video" else PHOTO_VIEW_SIZE, f" (auto: {sequence})"
+    if angle_deg is None:
         angle_deg = 0.0 if independent else VIDEO_REUSE_DEG
-        told = "at the very same pose alone" if independent else f"within {angle_deg:g} degrees"
-        why = "frames stand each by itself" if independent else sequence
-        config, notes["views used again"] = replace(config, reuse_angle_deg=angle_deg), f"{told} (auto: {why})"
-    return config
+        why_angle = f" (auto: {'frames stand each by itself' if independent else sequence})"
+    notes["view size"] = f"{size}{why_size}"
+    told = f"within {angle_deg:g} degrees" if angle_deg > 0 else "at the very same pose alone"
+    notes["views used again"] = f"{told}{why_angle}"
+    return replace(config, size=size, reuse_angle_deg=angle_deg)
 
 
 def _refinement(config: RefinementConfig, sequence: Sequence, notes: dict[str, str]) -> RefinementConfig:
     if config.when != "auto":
+        notes["refinement"] = config.when
         return config
     when: Literal["always", "never"] = "never" if sequence == "video" else "always"
     notes["refinement"] = f"{when} (auto: {sequence})"

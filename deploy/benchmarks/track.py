@@ -27,7 +27,7 @@ FULL, DEFAULT = "full", "default"
 _SETTINGS: dict[str, dict[str, Any]] = {
     # No pose is near enough to its guess, so that every frame has all its passes.
     FULL: {
-        "tracking": dict.fromkeys(("settled", "far"), {"angle_deg": 0.0, "distance": 0.0}),
+        "tracking": {name: {"angle_deg": 0.0, "distance": 0.0} for name in ("settled", "far")},
         "rendering": {"size": 400},
         "refinement": {"when": "always"},
     },

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import cast
 
 import tyro
 from rich.table import Table
 
-from fieldpose.bus.replay import RECORDING_RECORD, RecordingInfo, info
+from fieldpose.bus.messages import CameraInfo
+from fieldpose.bus.replay import RECORDING_RECORD, RecordingInfo, info, read_recording
+from fieldpose.bus.topics import CAMERA_INFO
 from fieldpose.deploy.reporting.output import result_console, write_json
 from fieldpose.deploy.reporting.provenance import PLAN_RECORD, RUN_RECORD
+from fieldpose.deploy.reporting.report import CAMERA_ORIGINS
 
 
 @dataclass(frozen=True)
@@ -23,7 +27,8 @@ class Options:
     Example: fieldpose info out/lego.mcap
 
     The JSON file has: path, size_bytes, messages, first_ns, last_ns, lossless, topics (key, topic, messages,
-    first_ns, last_ns, rate_hz), sources (key, source, received, written, missing), metadata, attachments (bytes).
+    first_ns, last_ns, rate_hz), sources (key, source, received, written, missing), metadata, attachments (bytes),
+    cameras (where the intrinsics of frames come from -> how many).
     """
 
     recording: tyro.conf.Positional[Path]
@@ -33,15 +38,21 @@ class Options:
 
     def run(self) -> int:
         """Print the tables."""
-        recording = info(self.recording)
-        write_json(self.json, asdict(recording))
+        recording, cameras = info(self.recording), _cameras(self.recording)
+        write_json(self.json, {**asdict(recording), "cameras": cameras})
         console = result_console()
-        console.print("\n".join(_description(recording)), highlight=False, soft_wrap=True)
+        console.print("\n".join(_description(recording, cameras)), highlight=False, soft_wrap=True)
         console.print(_topics(recording))
         return 0
 
 
-def _description(recording: RecordingInfo) -> Iterator[str]:
+def _cameras(path: Path) -> dict[str, int]:
+    """Where the intrinsics of the frames come from, and of how many."""
+    infos = (cast(CameraInfo, recorded.message) for recorded in read_recording(path, (CAMERA_INFO,)))
+    return dict(Counter(str(info.camera_origin) for info in infos))
+
+
+def _description(recording: RecordingInfo, cameras: Mapping[str, int]) -> Iterator[str]:
     seconds = (recording.last_ns - recording.first_ns) / 1e9
     began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(recording.first_ns / 1e9))
     size = f"{recording.size_bytes / 1e6:.1f} MB"
@@ -49,6 +60,7 @@ def _description(recording: RecordingInfo) -> Iterator[str]:
     yield "no message lost" if recording.lossless else f"NOT LOSSLESS{_why(recording)}"
     run = recording.metadata.get(RUN_RECORD, {})
     yield from (f"  {name}: {value}" for name, value in run.items())
+    yield from (f"  camera {CAMERA_ORIGINS[origin]}: {count} frames" for origin, count in cameras.items())
     yield from (f"  planned: {name}: {value}" for name, value in recording.metadata.get(PLAN_RECORD, {}).items())
     yield from (f"  attached: {name} ({count} bytes)" for name, count in recording.attachments.items())
 

@@ -13,10 +13,11 @@ from fieldpose.deploy.processes.pipeline import Progress
 from fieldpose.deploy.reporting.output import progress_console, result_console
 
 _MISSING = "-"
-_CAMERAS = {
-    "calibrated": "a calibration", "training": "the training views", "exif": "EXIF",
-    "assumed": "an ASSUMED field of view: no pose is sure; give --camera.camera-file",
+CAMERA_ORIGINS = {
+    "calibrated": "from a calibration", "training": "of the training views", "exif": "from EXIF",
+    "assumed": "with an ASSUMED field of view, so that no pose is sure; give --camera.camera-file",
 }  # fmt: skip
+"""Where a frame's intrinsics come from, in words."""
 
 
 @contextmanager
@@ -87,7 +88,7 @@ def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     if summary["cameras"].keys() - {"calibrated"}:
         yield (
             "camera taken from",
-            ", ".join(f"{_CAMERAS[origin]} {count}x" for origin, count in summary["cameras"].items()),
+            ", ".join(f"{CAMERA_ORIGINS[origin]} {count}x" for origin, count in summary["cameras"].items()),
         )
     for key, what, unit in (
         ("rotation_error_deg", "rotation error: median, mean, p90", "deg"),

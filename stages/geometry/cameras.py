@@ -11,6 +11,20 @@ import msgspec
 import numpy as np
 
 from fieldpose.errors import GeometryError
+from fieldpose.stages.geometry.arrays import (
+    Directions32,
+    Flags,
+    Matrices2,
+    Matrix3,
+    Normalised,
+    Pixels,
+    Pixels32,
+    Pixels64,
+    Points,
+    Points32,
+    Transform,
+    Values,
+)
 
 _LARGEST = 16384
 _UNDISTORTED = (0.0, 0.0, 0.0, 0.0, 0.0)
@@ -40,8 +54,8 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if not (1 <= self.width <= _LARGEST and 1 <= self.height <= _LARGEST and self.fx > 0 and self.fy > 0):
             raise GeometryError(f"a camera needs a size of 1 to {_LARGEST} and positive focal lengths, got {self}")
 
-    def matrix(self) -> np.ndarray:
-        """The (3, 3) intrinsic matrix, distortion left out."""
+    def matrix(self) -> Matrix3:
+        """The intrinsic matrix, distortion left out."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def resized(self, width: int, height: int) -> Camera:
@@ -64,13 +78,13 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Whether any distortion coefficient differs from zero."""
         return any(self.distortion)
 
-    def grid(self) -> np.ndarray:
-        """The (x, y) of every pixel, (height * width, 2) float32, row by row."""
+    def grid(self) -> Pixels32:
+        """Every pixel, row by row."""
         x, y = np.meshgrid(np.arange(self.width, dtype=np.float32), np.arange(self.height, dtype=np.float32))
         return np.stack([x.ravel(), y.ravel()], axis=1)
 
-    def directions(self, pixels: np.ndarray) -> np.ndarray:
-        """Directions (n, 3) float32 in the camera frame with z = 1 through pixels (n, 2), distortion removed.
+    def directions(self, pixels: Pixels) -> Directions32:
+        """Directions in the camera frame with z = 1 through pixels, distortion removed.
 
         GeometryError where the distortion has no inverse (it folds the image over itself at that pixel).
         """
@@ -83,16 +97,16 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             )
         return np.concatenate([ideal, np.ones((len(ideal), 1))], axis=1).astype(np.float32)
 
-    def without_distortion(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where pixels (n, 2) are in the image of the undistorted camera, (n, 2) float64, and which (n,) are at all.
+    def without_distortion(self, pixels: Pixels) -> tuple[Pixels64, Flags]:
+        """Where pixels are in the image of the undistorted camera, and which are at all.
 
         Those are not where the distortion has no inverse.
         """
         ideal, usable = self._ideal(pixels)
         return ideal * (self.fx, self.fy) + (self.cx, self.cy), usable
 
-    def project(self, points_in_cam: np.ndarray) -> np.ndarray:
-        """Pixels (n, 2) float64, with distortion, of points (n, 3) in the camera frame; NaN where z <= 0."""
+    def project(self, points_in_cam: Points) -> Pixels64:
+        """Pixels, with distortion, of points in the camera frame; NaN where z <= 0."""
         points = np.asarray(points_in_cam, dtype=np.float64)
         z = np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
         ideal = points[:, :2] / z
@@ -100,8 +114,8 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             ideal = distort(ideal, self.distortion)[0]
         return ideal * (self.fx, self.fy) + (self.cx, self.cy)
 
-    def _ideal(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Normalised image points (n, 2) of pixels, and whether (n,) they were found, by Newton's method.
+    def _ideal(self, pixels: Pixels) -> tuple[Normalised, Flags]:
+        """Pixels as normalised image points, and whether these were found, by Newton's method.
 
         Solutions where the derivative is not positive lie beyond the fold of the image and are none.
         """
@@ -138,8 +152,8 @@ def unscale_pixels(pixels: _Pixels, scale: _Pixels) -> _Pixels:
     return (pixels + 0.5) / scale - 0.5
 
 
-def distort(ideal: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Distorted points (n, 2) of ideal normalised image points (n, 2), and the (n, 2, 2) derivative by them.
+def distort(ideal: Normalised, distortion: tuple[float, ...]) -> tuple[Normalised, Matrices2]:
+    """Distorted image points of ideal ones, and the derivative by them.
 
     Source: Brown, Decentering distortion of lenses (1966), in OpenCV's order k1 k2 p1 p2 k3.
     """
@@ -158,10 +172,8 @@ def distort(ideal: np.ndarray, distortion: tuple[float, ...]) -> tuple[np.ndarra
     return distorted, jacobian
 
 
-def rays(
-    camera: Camera, cam_from_object: np.ndarray, pixels: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Origins and directions, each (n, 3) float32 in object coordinates, through pixels (n, 2) or all of grid().
+def rays(camera: Camera, cam_from_object: Transform, pixels: Pixels | None = None) -> tuple[Points32, Directions32]:
+    """Origins and directions in object coordinates, through pixels or all of grid().
 
     Directions have length 1 along the optical axis: ``origin + depth * direction`` is the point at that depth.
     """
@@ -172,8 +184,8 @@ def rays(
     return np.repeat(origin[None], len(directions), axis=0), directions
 
 
-def points_at_depth(camera: Camera, cam_from_object: np.ndarray, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Points (n, 3) float32 in object coordinates that are seen at pixels (n, 2), at depths (n,) along the axis."""
+def points_at_depth(camera: Camera, cam_from_object: Transform, pixels: Pixels, depths: Values) -> Points:
+    """Points in object coordinates that are seen at pixels, at depths along the axis."""
     origins, directions = rays(camera, cam_from_object, pixels)
     points: np.ndarray = origins + depths[:, None] * directions
     return points

@@ -5,28 +5,29 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from fieldpose.stages.geometry.arrays import Covariance, Points, Transform, Values
 from fieldpose.stages.geometry.rigid import camera_centre, inverse, log_se3
 
 
-def rotation_error_deg(cam_from_object_a: np.ndarray, cam_from_object_b: np.ndarray) -> float:
+def rotation_error_deg(cam_from_object_a: Transform, cam_from_object_b: Transform) -> float:
     """The angle of the rotation between two poses, 0 to 180 degrees."""
     between = Rotation.from_matrix(cam_from_object_a[:3, :3] @ cam_from_object_b[:3, :3].T)
     return float(np.rad2deg(between.magnitude()))
 
 
-def translation_error(cam_from_object_a: np.ndarray, cam_from_object_b: np.ndarray) -> float:
+def translation_error(cam_from_object_a: Transform, cam_from_object_b: Transform) -> float:
     """The distance between the two camera centres, in object units."""
     return float(np.linalg.norm(camera_centre(cam_from_object_a) - camera_centre(cam_from_object_b)))
 
 
-def mahalanobis_squared(cam_from_object: np.ndarray, covariance: np.ndarray, truth: np.ndarray) -> float:
-    """The squared error of a pose (4, 4) by the covariance (6, 6) of its left twist: chi squared if that is true."""
+def mahalanobis_squared(cam_from_object: Transform, covariance: Covariance, truth: Transform) -> float:
+    """The squared error of a pose by the covariance of its left twist: chi squared if that is true."""
     twist = log_se3(truth @ inverse(cam_from_object))
     return float(twist @ np.linalg.pinv(covariance) @ twist)
 
 
-def viewing_angles(points: np.ndarray, cam_from_object_a: np.ndarray, cam_from_object_b: np.ndarray) -> np.ndarray:
-    """The angles (n,) in radians between the directions in which two cameras see points (n, 3) of the object."""
+def viewing_angles(points: Points, cam_from_object_a: Transform, cam_from_object_b: Transform) -> Values:
+    """The angles in radians between the directions in which two cameras see points of the object."""
     first, second = points - camera_centre(cam_from_object_a), points - camera_centre(cam_from_object_b)
     cosine = (first * second).sum(axis=1) / np.linalg.norm(first, axis=1) / np.linalg.norm(second, axis=1)
     return np.arccos(np.clip(cosine, -1, 1))

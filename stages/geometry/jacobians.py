@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from fieldpose.stages.geometry.arrays import Jacobians2, Values
 
-def image_jacobian(x: np.ndarray, y: np.ndarray, inverse_depth: np.ndarray) -> np.ndarray:
-    """Derivatives (n, 2, 6) of normalised image points (x, y) by the left twist of cam_from_object.
 
-    x, y and inverse_depth, along the optical axis, are (n,). Source: Chaumette and Hutchinson, Visual servo control,
-    part I (2006), whose interaction matrix is by the camera's own velocity and so has the other sign.
+def image_jacobian(x: Values, y: Values, inverse_depth: Values) -> Jacobians2:
+    """Derivatives of normalised image points (x, y) by the left twist of cam_from_object; depth is along the axis.
+
+    Source: Chaumette and Hutchinson, Visual servo control, part I (2006), whose interaction matrix is by the camera's
+    own velocity and so has the other sign.
     """
     zero = np.zeros_like(x)
     of_x = np.stack([inverse_depth, zero, -x * inverse_depth, -x * y, 1 + x * x, -y], axis=1)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64
 
 from fieldpose.errors import ConfigError
+from fieldpose.stages.geometry.arrays import Transform, Transforms
 from fieldpose.stages.geometry.errors import rotation_error_deg, translation_error
 from fieldpose.stages.geometry.rigid import camera_centres
 
@@ -26,18 +28,18 @@ class Limit:
         """The limit whose distance is so many times larger: from shares of a length to object units."""
         return Limit(self.angle_deg, self.distance * scale)
 
-    def distance_ratio(self, a: np.ndarray, b: np.ndarray) -> float:
+    def distance_ratio(self, a: Transform, b: Transform) -> float:
         """How far apart two poses are in multiples of this limit, the worse of angle and distance."""
         angle = rotation_error_deg(a, b) / max(self.angle_deg, 1e-9)
         return max(angle, translation_error(a, b) / max(self.distance, 1e-12))
 
-    def holds(self, a: np.ndarray, b: np.ndarray) -> bool:
+    def holds(self, a: Transform, b: Transform) -> bool:
         """Whether each of two poses lies in the other's neighbourhood."""
         return self.distance_ratio(a, b) <= 1.0
 
 
-def pairwise(poses: np.ndarray, others: np.ndarray, limit: Limit) -> np.ndarray:
-    """Limit.distance_ratio of every pose (n, 4, 4) with every other (m, 4, 4), as (n, m)."""
+def pairwise(poses: Transforms, others: Float64[np.ndarray, "m 4 4"], limit: Limit) -> Float64[np.ndarray, "n m"]:
+    """Limit.distance_ratio of every pose with every other."""
     rotations, other_rotations = poses[:, :3, :3], others[:, :3, :3]
     traces = np.einsum("nij,mij->nm", rotations, other_rotations)
     angles = np.rad2deg(np.arccos(np.clip((traces - 1) / 2, -1, 1)))

@@ -13,26 +13,27 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from fieldpose.errors import GeometryError
+from fieldpose.stages.geometry.arrays import Matrix3, Matrix6, Points, Transform, Transforms, Twist, Vector
 
 _SMALL_ANGLE = 1e-4
 
 
-def skew(vector: ArrayLike) -> np.ndarray:
-    """The (3, 3) matrix whose product with u is vector x u."""
+def skew(vector: ArrayLike) -> Matrix3:
+    """The matrix whose product with u is vector x u."""
     x, y, z = np.asarray(vector, dtype=np.float64)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-def from_rotation(rotation: Rotation | ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> np.ndarray:
-    """Put a rotation (scipy Rotation or (3, 3)) and a translation (3,) together into (4, 4)."""
+def from_rotation(rotation: Rotation | ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Transform:
+    """Put a rotation (scipy Rotation or (3, 3)) and a translation (3,) together."""
     transform = np.eye(4)
     transform[:3, :3] = rotation.as_matrix() if isinstance(rotation, Rotation) else rotation
     transform[:3, 3] = translation
     return transform
 
 
-def exp_se3(twist: ArrayLike) -> np.ndarray:
-    """The (4, 4) rigid transform of a twist (6,); Lynch and Park, Modern Robotics, eq. 3.88."""
+def exp_se3(twist: ArrayLike) -> Transform:
+    """The rigid transform of a twist (6,); Lynch and Park, Modern Robotics, eq. 3.88."""
     translation, rotation = np.split(np.asarray(twist, dtype=np.float64), 2)
     angle = float(np.linalg.norm(rotation))
     cross = skew(rotation)
@@ -44,8 +45,8 @@ def exp_se3(twist: ArrayLike) -> np.ndarray:
     return from_rotation(Rotation.from_rotvec(rotation), left_jacobian @ translation)
 
 
-def log_se3(transform: np.ndarray) -> np.ndarray:
-    """The twist (6,) of a rigid transform, with a rotation of at most pi; Modern Robotics, eq. 3.91 and 3.92."""
+def log_se3(transform: Transform) -> Twist:
+    """The twist of a rigid transform, with a rotation of at most pi; Modern Robotics, eq. 3.91 and 3.92."""
     rotation = Rotation.from_matrix(transform[:3, :3]).as_rotvec()
     angle = float(np.linalg.norm(rotation))
     cross = skew(rotation)
@@ -55,14 +56,14 @@ def log_se3(transform: np.ndarray) -> np.ndarray:
     return np.concatenate([inverse_left_jacobian @ transform[:3, 3], rotation])
 
 
-def inverse(transform: np.ndarray) -> np.ndarray:
-    """source_from_target of a rigid target_from_source (4, 4)."""
+def inverse(transform: Transform) -> Transform:
+    """source_from_target of a rigid target_from_source."""
     rotation = transform[:3, :3].T
     return from_rotation(rotation, -rotation @ transform[:3, 3])
 
 
-def adjoint(transform: np.ndarray) -> np.ndarray:
-    """The (6, 6) matrix with ``T @ exp_se3(x) @ inverse(T) == exp_se3(adjoint(T) @ x)``."""
+def adjoint(transform: Transform) -> Matrix6:
+    """The matrix with ``T @ exp_se3(x) @ inverse(T) == exp_se3(adjoint(T) @ x)``."""
     rotation = transform[:3, :3]
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = rotation
@@ -83,7 +84,7 @@ def is_rigid(transform: ArrayLike, tolerance: float = 1e-4) -> bool:
     )
 
 
-def nearest_rigid(transform: np.ndarray) -> np.ndarray:
+def nearest_rigid(transform: Transform) -> Transform:
     """Replace the upper left (3, 3) by the rotation nearest to it in the Frobenius norm; keep the translation.
 
     Source: Arun, Huang and Blostein, Least-squares fitting of two 3-D point sets (1987).
@@ -93,17 +94,17 @@ def nearest_rigid(transform: np.ndarray) -> np.ndarray:
     return from_rotation(left @ handedness @ right, transform[:3, 3])
 
 
-def rotation_about(axis: ArrayLike, angle_rad: float) -> np.ndarray:
-    """Rotation (4, 4) by angle_rad about an axis (3,) through the origin. GeometryError if the axis is zero."""
+def rotation_about(axis: ArrayLike, angle_rad: float) -> Transform:
+    """Rotation by angle_rad about an axis (3,) through the origin. GeometryError if the axis is zero."""
     return from_rotation(Rotation.from_rotvec(angle_rad * _unit(axis, "the axis of a rotation")))
 
 
-def interpolate(start: np.ndarray, end: np.ndarray, alpha: float) -> np.ndarray:
+def interpolate(start: Transform, end: Transform, alpha: float) -> Transform:
     """The transform a share alpha along the screw motion from start (0) to end (1); alpha beyond 1 extrapolates."""
     return exp_se3(alpha * log_se3(end @ inverse(start))) @ start
 
 
-def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> np.ndarray:
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Transform:
     """cam_from_object (OpenCV axes) of a camera at eye that looks at target with up towards the image's top.
 
     Raises GeometryError if eye and target coincide or up is parallel to the viewing direction.
@@ -115,13 +116,13 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> np.ndarray:
     return inverse(object_from_cam)
 
 
-def camera_centre(cam_from_object: np.ndarray) -> np.ndarray:
-    """Where the camera is, (3,) in object coordinates."""
+def camera_centre(cam_from_object: Transform) -> Vector:
+    """Where the camera is, in object coordinates."""
     return -cam_from_object[:3, :3].T @ cam_from_object[:3, 3]
 
 
-def camera_centres(cam_from_object: np.ndarray) -> np.ndarray:
-    """camera_centre of each of several poses (n, 4, 4): (n, 3)."""
+def camera_centres(cam_from_object: Transforms) -> Points:
+    """camera_centre of each of several poses."""
     return -np.einsum("nji,nj->ni", cam_from_object[:, :3, :3], cam_from_object[:, :3, 3])
 
 

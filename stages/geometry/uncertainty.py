@@ -8,19 +8,27 @@ of its own measurements: a random effect; Laird and Ware, Random-effects models 
 from __future__ import annotations
 
 import numpy as np
+from jaxtyping import Float
+
+from fieldpose.stages.geometry.arrays import Covariance, Jacobians, Pixels
 
 _CELLS = 8
 _LEAST = 1e-14
 
 
 def twist_covariance(
-    jacobian: np.ndarray, weights: np.ndarray, pixels: np.ndarray, longer_side: int, variance: float, shared: float
-) -> np.ndarray:
-    """Covariance (6, 6) of the left twist that minimises weighted squared residuals.
+    jacobian: Jacobians,
+    weights: Float[np.ndarray, "n k k"],
+    pixels: Pixels,
+    longer_side: int,
+    variance: float,
+    shared: float,
+) -> Covariance:
+    """Covariance of the left twist that minimises weighted squared residuals, k of each of n > 0 pixels.
 
-    jacobian (n, k, 6) of k residuals of each of n pixels (n, 2), n > 0; weights (n, k, k), their inverse covariances up
-    to a factor; variance: of a residual of weight 1; shared: variance of the offset that all residuals of a cell have;
-    the image's longer side has eight cells. Directions that nothing determines have a huge variance.
+    weights: their inverse covariances up to a factor; variance: of a residual of weight 1; shared: variance of the
+    offset that all residuals of a cell have; the image's longer side has eight cells. Directions that nothing
+    determines have a huge variance.
     """
     weighted = weights @ jacobian
     inverse = _inverse(np.tensordot(weighted, jacobian, axes=((0, 1), (0, 1))))

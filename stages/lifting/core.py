@@ -12,6 +12,18 @@ import numpy as np
 
 from fieldpose.bus.messages import Reason
 from fieldpose.stages.geometry import Camera, camera_centre, points_at_depth
+from fieldpose.stages.geometry.arrays import (
+    AnyOpacity,
+    Depth,
+    Flags,
+    Pixels,
+    Points,
+    Points32,
+    Transform,
+    Values,
+    Values32,
+    Vector,
+)
 from fieldpose.stages.lifting.config import MAX_DEPTH_STEP, MIN_OPACITY, LiftingConfig
 from fieldpose.stages.lifting.memory import ConsistencyMemory, Remember
 from fieldpose.stages.nerf.rendering_api import RayRenderer
@@ -23,33 +35,32 @@ _NEVER = np.float32(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class Lifted:
-    """points_in_object (n, 3) float32; consistency (n,) float32, the paper's m in squared units; kept (n,) bool.
+    """Points, their consistency, the paper's m in squared units, and whether to keep them.
 
     Points of pixels that show no surface are at the camera's centre, with the largest finite consistency.
     """
 
-    points_in_object: np.ndarray
-    consistency: np.ndarray
-    kept: np.ndarray
+    points_in_object: Points32
+    consistency: Values32
+    kept: Flags
 
 
 def lift(
     renderer: RayRenderer,
-    depth: np.ndarray,
-    opacity: np.ndarray,
+    depth: Depth,
+    opacity: AnyOpacity,
     camera: Camera,
-    cam_from_object: np.ndarray,
-    pixels_in_view: np.ndarray,
+    cam_from_object: Transform,
+    pixels_in_view: Pixels,
     rng: np.random.Generator,
     config: LiftingConfig | None = None,
     remember: Remember | None = None,
 ) -> Lifted | Reason:
-    """Lift pixels (n, 2) of a view and mark the points to keep.
+    """Lift pixels of a view and mark the points to keep.
 
-    depth (h, w) along the optical axis, opacity (h, w) in 0..1 or uint8, camera and cam_from_object are the view's.
-    `rng` turns the ring of nearby views; the renderer is asked once, for all points and views, or for those pixels
-    alone that `remember`, for a view that comes again, does not know. TOO_FEW_CONSISTENT_POINTS where less are kept
-    than the configuration asks for.
+    depth, opacity, camera and cam_from_object are the view's. `rng` turns the ring of nearby views; the renderer is
+    asked once, for all points and views, or for those pixels alone that `remember`, for a view that comes again, does
+    not know. TOO_FEW_CONSISTENT_POINTS where less are kept than the configuration asks for.
     """
     config = config or LiftingConfig()
     depths = depth_at(depth, pixels_in_view, MAX_DEPTH_STEP)
@@ -71,18 +82,18 @@ def lift(
     return Lifted(points, spread, kept) if kept.sum() >= config.min_kept else Reason.TOO_FEW_CONSISTENT_POINTS
 
 
-def _consistent(displacement: np.ndarray, config: LiftingConfig) -> np.ndarray:
-    """Which points (n,) to keep by their displacement, in multiples of gamma."""
+def _consistent(displacement: Values, config: LiftingConfig) -> Flags:
+    """Which points to keep by their displacement, in multiples of gamma."""
     ranked = np.sort(displacement)
     last = min(config.enough, len(ranked)) - 1
     enough = ranked[last] if last >= 0 else 0.0
     return displacement <= np.clip(enough, 1.0, max(config.gamma_most, 1.0))
 
 
-def depth_at(depth: np.ndarray, pixels: np.ndarray, max_step: float) -> np.ndarray:
-    """Depth (n,) at pixels (n, 2): bilinear where the four around it are one surface, else that of the nearest.
+def depth_at(depth: Depth, pixels: Pixels, max_step: float) -> Values32:
+    """Depth at pixels: bilinear where the four around it are one surface, else that of the nearest.
 
-    One surface means that they differ by at most the share `max_step`; 0 in `depth` is no surface.
+    One surface means that they differ by at most the share `max_step`.
     """
     height, width = depth.shape
     corner = np.clip(np.floor(pixels), 0, (max(width - 2, 0), max(height - 2, 0))).astype(int)
@@ -98,12 +109,12 @@ def depth_at(depth: np.ndarray, pixels: np.ndarray, max_step: float) -> np.ndarr
 
 def consistency(
     renderer: RayRenderer,
-    points: np.ndarray,
-    camera_centre: np.ndarray,
+    points: Points,
+    camera_centre: Vector,
     rng: np.random.Generator,
     config: LiftingConfig,
-) -> np.ndarray:
-    """The paper's m (n,) float32: mean or median squared distance of points (n, 3) from where nearby views see them.
+) -> Values32:
+    """The paper's m: mean or median squared distance of points from where nearby views see them.
 
     The views lie on a circle around the camera's centre, at the same distance from the point, evenly spaced.
     """

@@ -19,6 +19,7 @@ from cachetools import LRUCache
 from fieldpose.bus.messages import Reason
 from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry import shrunk_size, unscale_pixels
+from fieldpose.stages.geometry.arrays import AnyOpacity, FrameImage, Grey, Image, Mask, Pixels32, Values32
 from fieldpose.stages.images import shrunk
 from fieldpose.stages.matching.subpixel import align_patches
 
@@ -70,20 +71,20 @@ class MatchingConfig:
 
 @dataclass(frozen=True)
 class Features:
-    """An image to a matcher: its keypoints (n, 2) float32, its size (width, height), the matcher's own data."""
+    """An image to a matcher: its keypoints, its size (width, height), the matcher's own data."""
 
-    pixels: np.ndarray
+    pixels: Pixels32
     size: tuple[int, int]
     data: Any
 
 
 @dataclass(frozen=True)
 class MatchedPixels:
-    """pixels_a and pixels_b (n, 2) float32 that show the same point; confidence (n,) float32 in 0..1."""
+    """pixels_a and pixels_b that show the same point; confidence in 0..1."""
 
-    pixels_a: np.ndarray
-    pixels_b: np.ndarray
-    confidence: np.ndarray
+    pixels_a: Pixels32
+    pixels_b: Pixels32
+    confidence: Values32
 
 
 class Matcher(Protocol):
@@ -92,8 +93,8 @@ class Matcher(Protocol):
     placed_between_pixels: bool
     """Whether matches are precise to a fraction of a pixel; if not, they are moved there by their patches."""
 
-    def extract(self, image: np.ndarray, mask: np.ndarray | None = None) -> Features:
-        """Features of an image (h, w, 3) uint8, only where mask (h, w) bool is true."""
+    def extract(self, image: Image, mask: Mask | None = None) -> Features:
+        """Features of an image, only where mask is true."""
         ...
 
     def match(self, view: Features, frame: Features) -> MatchedPixels:
@@ -105,7 +106,7 @@ class Matcher(Protocol):
 class ExtractsAtOnce(Protocol):
     """A matcher that takes the features of several images in less time than one after the other."""
 
-    def extract_all(self, images: Sequence[tuple[np.ndarray, np.ndarray | None]]) -> list[Features]:
+    def extract_all(self, images: Sequence[tuple[Image, Mask | None]]) -> list[Features]:
         """What `extract` gives for images of one size, each with its mask."""
         ...
 
@@ -119,8 +120,8 @@ def build_matcher(config: MatchingConfig) -> Matcher:
     return matcher
 
 
-def visible_mask(opacity: np.ndarray, erode_px: int) -> np.ndarray:
-    """Where a view (h, w), opacity in 0..1 or uint8, shows the object, `erode_px` inside its silhouette, bool."""
+def visible_mask(opacity: AnyOpacity, erode_px: int) -> Mask:
+    """Where a view shows the object, `erode_px` inside its silhouette."""
     half = 127 if opacity.dtype == np.uint8 else 0.5
     visible = (opacity > half).astype(np.uint8)
     eroded = cv2.erode(visible, np.ones((2 * erode_px + 1,) * 2, np.uint8)) if erode_px > 0 else visible
@@ -138,13 +139,13 @@ class PairMatcher:
 
     def match(
         self,
-        view_rgb: np.ndarray,
-        view_opacity: np.ndarray,
-        frame_image: np.ndarray,
+        view_rgb: Image,
+        view_opacity: AnyOpacity,
+        frame_image: FrameImage,
         view_key: Hashable | None = None,
         frame_key: Hashable | None = None,
     ) -> MatchedPixels | Reason:
-        """Match a view (h, w, 3) uint8 with opacity (h, w) and a frame (h', w', 3) uint8, in their own pixels.
+        """Match a view and a frame, in their own pixels.
 
         Only pixels of the view that show the object are matched. Features are kept under the keys, where given.
         TOO_FEW_MATCHES where they are less than the configuration asks for.
@@ -162,12 +163,12 @@ class PairMatcher:
         in_frame = unscale_pixels(pixels_b, frame.scale).astype(np.float32)
         return MatchedPixels(matched.pixels_a, in_frame, confidence)
 
-    def view_features(self, rgb: np.ndarray, opacity: np.ndarray, view_key: Hashable) -> Features:
-        """The features of a view (h, w, 3) uint8 with opacity (h, w); kept for a match, as there."""
+    def view_features(self, rgb: Image, opacity: AnyOpacity, view_key: Hashable) -> Features:
+        """The features of a view; kept for a match, as there."""
         return self._view(rgb, opacity, view_key).features
 
-    def frame_features(self, frame_image: np.ndarray, longer_side: int, frame_key: Hashable | None = None) -> Features:
-        """The features of a frame (h, w, 3) uint8, shrunk to `longer_side`; kept for a match at that size."""
+    def frame_features(self, frame_image: Image, longer_side: int, frame_key: Hashable | None = None) -> Features:
+        """The features of a frame, shrunk to `longer_side`; kept for a match at that size."""
         return self._frame(frame_image, longer_side, frame_key).features
 
     def _both(
@@ -200,10 +201,10 @@ class PairMatcher:
 
 @dataclass(frozen=True)
 class _Seen:
-    """An image's features, its grey values (h, w) uint8 as matched, and its (x, y) scale: matched / given."""
+    """An image's features, its grey values as matched, and its (x, y) scale: matched / given."""
 
     features: Features
-    grey: np.ndarray
+    grey: Grey
     scale: np.ndarray
 
 

@@ -6,7 +6,19 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from jaxtyping import Float
 
+from fieldpose.stages.geometry.arrays import (
+    Colours32,
+    Depth,
+    Directions32,
+    Image,
+    Jacobians,
+    Opacity,
+    Points32,
+    Transform,
+    Values32,
+)
 from fieldpose.stages.geometry.cameras import Camera
 
 
@@ -14,40 +26,39 @@ from fieldpose.stages.geometry.cameras import Camera
 class RenderedRays:
     """Rays composited over the field's background.
 
-    rgb: (n, 3) float32 in 0..1.  depth: (n,) float32, the multiple of the ray's direction at which the surface lies
-    (0 where opacity is 0); with directions of z = 1 in the camera it is the depth along the optical axis.
-    opacity: (n,) float32 in 0..1.
+    rgb and opacity are in 0..1.  depth: the multiple of the ray's direction at which the surface lies (0 where opacity
+    is 0); with directions of z = 1 in the camera it is the depth along the optical axis.
     """
 
-    rgb: np.ndarray
-    depth: np.ndarray
-    opacity: np.ndarray
+    rgb: Colours32
+    depth: Values32
+    opacity: Values32
 
 
 @dataclass(frozen=True)
 class RenderedView:
-    """rgb (h, w, 3) uint8, depth (h, w) float32 along the optical axis, opacity (h, w) float32 in 0..1."""
+    """What a camera sees of a field."""
 
-    rgb: np.ndarray
-    depth: np.ndarray
-    opacity: np.ndarray
+    rgb: Image
+    depth: Depth
+    opacity: Opacity
     camera: Camera
-    cam_from_object: np.ndarray
+    cam_from_object: Transform
 
 
 class RayRenderer(Protocol):
     """A trained field that can be rendered."""
 
-    def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
-        """Render (n, 3) float32 rays in object coordinates; directions keep their length."""
+    def render_rays(self, origins: Points32, directions: Directions32) -> RenderedRays:
+        """Render rays in object coordinates; directions keep their length."""
         ...
 
     def render_rays_jacobian(
-        self, origins: np.ndarray, directions: np.ndarray, channel_weights: np.ndarray
-    ) -> tuple[RenderedRays, np.ndarray]:
-        """Also return (n, k, 6): d(channel_weights (k, 3) @ rgb) / d(origin, direction) of each ray."""
+        self, origins: Points32, directions: Directions32, channel_weights: Float[np.ndarray, "k 3"]
+    ) -> tuple[RenderedRays, Jacobians]:
+        """Also return d(channel_weights @ rgb) / d(origin, direction) of each ray."""
         ...
 
-    def render_view(self, camera: Camera, cam_from_object: np.ndarray) -> RenderedView:
+    def render_view(self, camera: Camera, cam_from_object: Transform) -> RenderedView:
         """Render every pixel of an undistorted camera."""
         ...

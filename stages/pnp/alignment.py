@@ -14,8 +14,21 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from jaxtyping import Bool, Float
 
 from fieldpose.stages.geometry import Camera, inverse, unscale_pixels
+from fieldpose.stages.geometry.arrays import (
+    Depth,
+    FrameImage,
+    Grey,
+    Image,
+    Indices,
+    Matrices2,
+    Pixels,
+    Pixels64,
+    Points,
+    Transform,
+)
 from fieldpose.stages.images import shrunk_with_camera
 from fieldpose.stages.pnp import constants
 from fieldpose.stages.pnp.config import PnpConfig
@@ -34,40 +47,39 @@ _NO_SURFACE = np.float32(1e3)
 class Pictures:
     """The rendered view that gave the points, and the frame whose pose is wanted.
 
-    view: (h, w, 3) uint8.  depth: (h, w) along the optical axis, 0 where nothing is.  camera (undistorted) and
-    cam_from_object (4, 4) are the view's.  frame: (h', w', 3) uint8.
+    depth, camera (undistorted) and cam_from_object are the view's.
     """
 
-    view: np.ndarray
-    depth: np.ndarray
+    view: Image
+    depth: Depth
     camera: Camera
-    cam_from_object: np.ndarray
-    frame: np.ndarray
+    cam_from_object: Transform
+    frame: FrameImage
 
     @cached_property
-    def grey(self) -> np.ndarray:
-        """The view's grey values (h, w) uint8."""
+    def grey(self) -> Grey:
+        """The view's grey values."""
         return cv2.cvtColor(self.view, cv2.COLOR_RGB2GRAY)
 
 
 @dataclass(frozen=True)
 class Placed:
-    """Points that were found in the frame: `index` (m,) of them, their pixels (m, 2) float64, and how exact these are.
+    """Points that were found in the frame: which, their pixels, and how exact these are.
 
-    weights: (m, 2, 2), their inverse covariances up to a factor: an edge's patch tells nothing of where it is along it.
-    seen: (n,) bool, which points the pose puts into the frame.
+    weights: their inverse covariances up to a factor: an edge's patch tells nothing of where it is along it.
+    seen: which of all points the pose puts into the frame.
     """
 
-    index: np.ndarray
-    pixels: np.ndarray
-    weights: np.ndarray
-    seen: np.ndarray
+    index: Indices
+    pixels: Pixels64
+    weights: Matrices2
+    seen: Bool[np.ndarray, " points"]
 
 
 class Aligner:
-    """Finds points (n, 3) of the object, seen in a view, in a frame of the camera."""
+    """Finds points of the object, seen in a view, in a frame of the camera."""
 
-    def __init__(self, pictures: Pictures, points: np.ndarray, camera: Camera, config: PnpConfig) -> None:
+    def __init__(self, pictures: Pictures, points: Points, camera: Camera, config: PnpConfig) -> None:
         self._view_camera, self._view_pose, self._config = pictures.camera, pictures.cam_from_object, config
         grey = cv2.cvtColor(pictures.frame, cv2.COLOR_RGB2GRAY)
         frame, self._camera = shrunk_with_camera(grey, camera, max(pictures.grey.shape))
@@ -86,7 +98,7 @@ class Aligner:
             yield level, _LOOSER * finest * 2**level
         yield 0, finest
 
-    def place(self, cam_from_object: np.ndarray, level: int, most: int | None = None) -> Placed:
+    def place(self, cam_from_object: Transform, level: int, most: int | None = None) -> Placed:
         """Look for the points, or `most` of them, near where a pose puts them; patches are 2^level pixels coarse."""
         smaller = np.float32(0.5**level)
         width, height, count = self._camera.width, self._camera.height, len(self._pixels)
@@ -115,8 +127,8 @@ class Aligner:
         return Placed(index[found], pixels, np.linalg.inv(covariance + constants.ALIGN_FLOOR_PX**2 * np.eye(2)), seen)
 
 
-def inverse_depth_slopes(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-    """Derivatives (n, 2) of the inverse depth by the pixel at pixels (n, 2) of a depth image (h, w), 0 for no surface.
+def inverse_depth_slopes(depth: Float[np.ndarray, "h w"], pixels: Pixels) -> Float[np.ndarray, "n 2"]:
+    """Derivatives of the inverse depth by the pixel at pixels of a depth image, 0 for no surface.
 
     Of the differences to either side the smaller one counts, which does not reach over an edge.
     """

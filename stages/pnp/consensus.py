@@ -10,8 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import poselib
+from jaxtyping import Float64
 
 from fieldpose.stages.geometry import Camera, is_rigid
+from fieldpose.stages.geometry.arrays import Indices, Pixels, Pixels64, Points64, Transform, Values
 from fieldpose.stages.pnp import constants
 from fieldpose.stages.pnp.alignment import Aligner
 from fieldpose.stages.pnp.config import PnpConfig
@@ -33,14 +35,14 @@ _REFERENCE_SIDE_PX = 400
 
 @dataclass(frozen=True)
 class Consensus:
-    """A pose and what agrees on it: `index` (m,) of the points, their pixels (m, 2) in the frame, distorted.
+    """A pose and what agrees on it: `index` of the points, their pixels in the frame, distorted.
 
     The first `matched` points are the matches', the others landmarks, of which `marks` were looked for.
     """
 
     fit: PoseFit
-    index: np.ndarray
-    pixels: np.ndarray
+    index: Indices
+    pixels: Pixels
     matched: int
     marks: int
 
@@ -61,12 +63,11 @@ class Consensus:
 
 
 def agreed_pose(
-    pixels_in_frame: np.ndarray, points: np.ndarray, camera: Camera, weights: np.ndarray, config: PnpConfig
+    pixels_in_frame: Pixels, points: Points64, camera: Camera, weights: Values, config: PnpConfig
 ) -> Consensus | None:
     """The pose that most matches agree on, fitted to these; None where too few do.
 
-    pixels_in_frame (n, 2), distorted as the camera has them, where those without an inverse agree on nothing; points
-    (n, 3) in the object; weights (n,).
+    Pixels are distorted as the camera has them, where those without an inverse agree on nothing.
     """
     pixels, usable = camera.without_distortion(pixels_in_frame)
     index, plain = np.flatnonzero(usable), camera.undistorted()
@@ -85,19 +86,19 @@ def agreed_pose(
 
 
 def confirmed_pose(
-    pixels_in_frame: np.ndarray,
-    points: np.ndarray,
+    pixels_in_frame: Pixels,
+    points: Float64[np.ndarray, "all_points 3"],
     camera: Camera,
-    weights: np.ndarray,
+    weights: Values,
     aligner: Aligner,
     config: PnpConfig,
 ) -> Consensus | None:
     """Of the poses that matches agree on, the one at which the most points are found in the frame.
 
-    points: those of the matches, whose pixels (n, 2) and weights (n,) are given, then landmarks, which no match has
-    chosen. The first pose is it if many landmarks are found. If not, the matches that agreed so far are left out, for
-    others to agree on another pose, as they do where the object has parts that look alike. If too little is found at
-    each, it is the first after all, if enough matches agree on it, else None.
+    points: those of the matches, whose pixels and weights are given, then landmarks, which no match has chosen. The
+    first pose is it if many landmarks are found. If not, the matches that agreed so far are left out, for others to
+    agree on another pose, as they do where the object has parts that look alike. If too little is found at each, it is
+    the first after all, if enough matches agree on it, else None.
     """
     count = len(pixels_in_frame)
     marks = len(points) - count
@@ -152,12 +153,9 @@ def _aligned(
 
 
 def _ransac(
-    pixels: np.ndarray, points: np.ndarray, camera: Camera, threshold: float, config: PnpConfig
-) -> np.ndarray | None:
-    """The pose that most correspondences agree on, or None.
-
-    pixels (n, 2) and points (n, 3) float64, the camera without distortion.
-    """
+    pixels: Pixels64, points: Points64, camera: Camera, threshold: float, config: PnpConfig
+) -> Transform | None:
+    """The pose that most correspondences agree on, or None; the camera is without distortion."""
     model = {"model": "PINHOLE", "width": camera.width, "height": camera.height}
     intrinsics = [camera.fx, camera.fy, camera.cx, camera.cy]
     options = {

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool
 
 from fieldpose.bus.messages import Reason
 from fieldpose.stages.geometry import Camera, camera_centre, twist_covariance, viewing_angles
+from fieldpose.stages.geometry.arrays import Covariance, Pixels, Pixels32, Points, Transform, Values
 from fieldpose.stages.pnp import constants
 from fieldpose.stages.pnp.alignment import Aligner, Pictures
 from fieldpose.stages.pnp.config import PnpConfig
@@ -23,34 +25,33 @@ _LEAST_CONFIDENCE = 0.01
 class PnpResult:
     """A pose, what agrees on it, and how certain it is.
 
-    inliers: (n,) bool, of the points given.  inliers_in_frame: (m, 2) float32, their pixels as matched, or as found in
-    the frame since, and there those of landmarks too.  correspondences: how many points these m were among.
-    residual_px: root mean square over the m.  covariance: (6, 6) of the left twist (translation, rotation) of
-    cam_from_object, in the object's unit and radians.
+    inliers: which of the points given.  inliers_in_frame: their n pixels as matched, or as found in the frame since,
+    and there those of landmarks too.  correspondences: how many points these n were among.  residual_px: root mean
+    square over the n.  covariance: in the object's unit and radians.
     """
 
-    cam_from_object: np.ndarray
-    inliers: np.ndarray
-    inliers_in_frame: np.ndarray
+    cam_from_object: Transform
+    inliers: Bool[np.ndarray, " given"]
+    inliers_in_frame: Pixels32
     correspondences: int
     residual_px: float
-    covariance: np.ndarray
+    covariance: Covariance
 
 
 def solve(
-    pixels_in_frame: np.ndarray,
-    points_in_object: np.ndarray,
+    pixels_in_frame: Pixels,
+    points_in_object: Points,
     camera: Camera,
     config: PnpConfig | None = None,
-    confidence: np.ndarray | None = None,
-    seen_from: np.ndarray | None = None,
+    confidence: Values | None = None,
+    seen_from: Transform | None = None,
     pictures: Pictures | None = None,
 ) -> PnpResult | Reason:
-    """The camera's pose from pixels (n, 2), distorted as the camera has them, and points (n, 3) in the object.
+    """The camera's pose from pixels, distorted as the camera has them, and points in the object.
 
-    confidence (n,), relative to each other, counts in the refinement and not in RANSAC. pictures: the view that gave
+    confidence, relative to each other, counts in the refinement and not in RANSAC. pictures: the view that gave
     the points, and the frame; with them all points are looked for anew near where RANSAC's pose puts them, whatever
-    they were matched with, and landmarks of the view besides. seen_from (4, 4): where the view was, if there are none;
+    they were matched with, and landmarks of the view besides. seen_from: where the view was, if there are none;
     the further it is from the pose found, the less certain is that. The same input gives the same result. Data
     that hold no pose give the reason: TOO_FEW_CONSISTENT_POINTS, NO_CONSENSUS or IMPLAUSIBLE_POSE.
     """

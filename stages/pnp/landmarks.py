@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from fieldpose.stages.geometry import points_at_depth
+from fieldpose.stages.geometry.arrays import Depth, Grey, Pixels32, Points64
 from fieldpose.stages.pnp.alignment import Pictures
 
 _LEAST_QUALITY = 0.01
@@ -18,8 +19,8 @@ _LARGEST_STEP = 0.1
 _AROUND = np.ones((3, 3), np.uint8)
 
 
-def landmarks(pictures: Pictures, most: int) -> np.ndarray:
-    """Points (n, 3) of the object, at most so many: those whose surroundings in the view have the most texture.
+def landmarks(pictures: Pictures, most: int) -> Points64:
+    """Points of the object, at most so many: those whose surroundings in the view have the most texture.
 
     None is taken where the depth steps between neighbours by a tenth or more, as it does where the object ends.
     """
@@ -29,8 +30,8 @@ def landmarks(pictures: Pictures, most: int) -> np.ndarray:
     return points.astype(np.float64)
 
 
-def _corners(grey: np.ndarray, depth: np.ndarray, most: int) -> np.ndarray:
-    """Pixels (n, 2) float32, whole numbers, the best ones first."""
+def _corners(grey: Grey, depth: Depth, most: int) -> Pixels32:
+    """Pixels, whole numbers, the best ones first."""
     left, top, width, height = cv2.boundingRect((depth > 0).astype(np.uint8))
     if most == 0 or min(width, height) < _WINDOW_PX:
         return np.zeros((0, 2), np.float32)
@@ -44,8 +45,8 @@ def _corners(grey: np.ndarray, depth: np.ndarray, most: int) -> np.ndarray:
     return pixels
 
 
-def _continuous(depth: np.ndarray) -> np.ndarray:
-    """1 where the eight pixels around (h, w) show the same surface, 0 elsewhere; uint8."""
+def _continuous(depth: Depth) -> Grey:
+    """1 where the eight pixels around show the same surface, 0 elsewhere."""
     nearest, farthest = cv2.erode(depth, _AROUND), cv2.dilate(depth, _AROUND)
     continuous: np.ndarray = (nearest > 0) & (farthest - nearest < _LARGEST_STEP * farthest)
     return continuous.astype(np.uint8)

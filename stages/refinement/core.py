@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fieldpose.stages.geometry import Camera, scale_pixels
+from fieldpose.stages.geometry.arrays import Covariance, Image, Pixels, Transform
 from fieldpose.stages.images import shrunk_with_camera
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 from fieldpose.stages.refinement import constants
@@ -27,27 +28,27 @@ _MIN_PIXELS = 64
 class RefinementResult:
     """The better of the pose before and after, and the held-out loss of both (None where nothing was tried).
 
-    Losses are robust, of colour differences in 0..1, on the same pixels with the same weights. covariance: (6, 6) of
-    the left twist of a refined pose, None of one that was left as it was.
+    Losses are robust, of colour differences in 0..1, on the same pixels with the same weights. covariance: of a refined
+    pose, None of one that was left as it was.
     """
 
-    cam_from_object: np.ndarray
+    cam_from_object: Transform
     refined: bool
     loss_before: float | None
     loss_after: float | None
     steps: int
-    covariance: np.ndarray | None = None
+    covariance: Covariance | None = None
 
 
 def refine(
     renderer: RayRenderer,
-    image: np.ndarray,
+    image: Image,
     camera: Camera,
-    cam_from_object: np.ndarray,
-    keypoints_in_frame: np.ndarray,
+    cam_from_object: Transform,
+    keypoints_in_frame: Pixels,
     config: RefinementConfig | None = None,
 ) -> RefinementResult:
-    """Refine the pose of a frame (h, w, 3) uint8 whose matched keypoints are given, (n, 2) pixels.
+    """Refine the pose of a frame whose matched keypoints are given.
 
     Returns the pose unchanged, `refined` false, where the refined one is no better or there is nothing to compare. The
     same input gives the same result.

@@ -10,8 +10,23 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from fieldpose.stages.geometry import Camera, image_jacobian, twist_covariance, twist_gradient
+from fieldpose.stages.geometry.arrays import (
+    Covariance,
+    Directions32,
+    Image,
+    Jacobians,
+    Mask,
+    Matrix6,
+    Pixels,
+    Points32,
+    Transform,
+    Twist,
+    Values,
+    Values32,
+)
 from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedRays
 from fieldpose.stages.refinement import constants
 from fieldpose.stages.refinement.config import RefinementConfig
@@ -24,15 +39,15 @@ _GREY = np.array([[0.299, 0.587, 0.114]], np.float32)
 
 @dataclass(frozen=True)
 class PixelSample:
-    """Pixels of a frame: directions (n, 3) float32 in the camera, z = 1; colours (n, k) in 0..1; weights (n,).
+    """Pixels of a frame: directions in the camera, z = 1; colours in 0..1.
 
-    slopes (n, k, 2): derivatives of the colours by the direction's x and y.
+    slopes: derivatives of the colours by the direction's x and y.
     """
 
-    directions: np.ndarray
-    colours: np.ndarray
-    slopes: np.ndarray
-    weights: np.ndarray
+    directions: Directions32
+    colours: Float[np.ndarray, "n k"]
+    slopes: Float[np.ndarray, "n k 2"]
+    weights: Values
 
     def part(self, chosen: np.ndarray | slice) -> PixelSample:
         """Some of the pixels."""
@@ -42,11 +57,11 @@ class PixelSample:
 
 @dataclass(frozen=True)
 class Linearised:
-    """loss at a pose, and Gauss-Newton's gradient (6,) and Hessian (6, 6) of it by the left twist."""
+    """loss at a pose, and Gauss-Newton's gradient and Hessian of it by the left twist."""
 
     loss: float
-    gradient: np.ndarray
-    hessian: np.ndarray
+    gradient: Twist
+    hessian: Matrix6
 
 
 class Photometric:
@@ -57,8 +72,8 @@ class Photometric:
         self._through_field, self._blur_px = config.derivative == "field", constants.BLUR_PX
         self._channels = np.eye(3, dtype=np.float32) if config.colours == "rgb" else _GREY
 
-    def sample(self, image: np.ndarray, camera: Camera, pixels: np.ndarray) -> PixelSample:
-        """The colours of whole pixels (n, 2) of an image (h, w, 3) uint8; all count the same."""
+    def sample(self, image: Image, camera: Camera, pixels: Pixels) -> PixelSample:
+        """The colours of whole pixels of an image; all count the same."""
         x, y = pixels.astype(int).T
         values = (image.astype(np.float32) / 255 @ self._channels.T).reshape(*image.shape[:2], -1)
         smooth = cv2.GaussianBlur(values, (0, 0), self._blur_px) if self._blur_px > 0 else values
@@ -67,18 +82,18 @@ class Photometric:
         ones = np.ones(len(pixels), np.float32)
         return PixelSample(camera.directions(pixels), values[y, x], np.stack([across, down], axis=2), ones)
 
-    def weighted_by_opacity(self, sample: PixelSample, cam_from_object: np.ndarray) -> tuple[PixelSample, float]:
+    def weighted_by_opacity(self, sample: PixelSample, cam_from_object: Transform) -> tuple[PixelSample, float]:
         """The sample with weights that tell surface from background at a pose, and the median depth (0: no hit)."""
         rendered = self._renderer.render_rays(*_rays(sample, cam_from_object))
         hit = rendered.depth[rendered.opacity > 0.5]
         return replace(sample, weights=rendered.opacity**_SHARPNESS), float(np.median(hit)) if len(hit) else 0.0
 
-    def loss(self, sample: PixelSample, cam_from_object: np.ndarray) -> float:
+    def loss(self, sample: PixelSample, cam_from_object: Transform) -> float:
         """The weighted mean loss at a pose."""
         rendered = self._renderer.render_rays(*_rays(sample, cam_from_object))
         return self._mean(*self._compare(sample, rendered))
 
-    def linearise(self, sample: PixelSample, cam_from_object: np.ndarray) -> Linearised:
+    def linearise(self, sample: PixelSample, cam_from_object: Transform) -> Linearised:
         """The loss at a pose and its derivatives by the left twist."""
         rendered, jacobian = self._render(sample, cam_from_object)
         residuals, weights = self._compare(sample, rendered)
@@ -87,8 +102,8 @@ class Photometric:
         pulled = pull.reshape(-1, 1) * flat
         return Linearised(self._mean(residuals, weights), pulled.T @ residuals.ravel(), pulled.T @ flat)
 
-    def covariance(self, sample: PixelSample, cam_from_object: np.ndarray, camera: Camera, shared: float) -> np.ndarray:
-        """Covariance (6, 6) of the left twist of a pose that pixels like these were fitted by; see twist_covariance.
+    def covariance(self, sample: PixelSample, cam_from_object: Transform, camera: Camera, shared: float) -> Covariance:
+        """Covariance of a pose that pixels like these were fitted by; see twist_covariance.
 
         shared: how far neighbouring pixels err together, as a multiple of a typical residual.
         """
@@ -104,8 +119,8 @@ class Photometric:
             float(variance), shared**2 * float(variance) / typical,
         )  # fmt: skip
 
-    def _render(self, sample: PixelSample, cam_from_object: np.ndarray) -> tuple[RenderedRays, np.ndarray]:
-        """Colours at a pose and their derivative (n, k, 6) by the left twist."""
+    def _render(self, sample: PixelSample, cam_from_object: Transform) -> tuple[RenderedRays, Jacobians]:
+        """Colours at a pose and their derivative by the left twist."""
         origins, directions = _rays(sample, cam_from_object)
         if self._through_field:
             rendered, by_ray = self._renderer.render_rays_jacobian(origins, directions, self._channels)
@@ -123,8 +138,8 @@ class Photometric:
         return float((weights * loss).sum() / max(weights.sum(), 1e-12))
 
 
-def keypoint_region(keypoints: np.ndarray, camera: Camera, dilations: int) -> np.ndarray:
-    """Mask (h, w) bool of the keypoints (n, 2), dilated `dilations` times by 5 x 5 pixels."""
+def keypoint_region(keypoints: Pixels, camera: Camera, dilations: int) -> Mask:
+    """Mask of the keypoints, dilated `dilations` times by 5 x 5 pixels."""
     mask = np.zeros((camera.height, camera.width), np.uint8)
     x, y = np.rint(keypoints).astype(int).T
     inside = (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
@@ -132,15 +147,15 @@ def keypoint_region(keypoints: np.ndarray, camera: Camera, dilations: int) -> np
     return cv2.dilate(mask, np.ones((5, 5), np.uint8), iterations=dilations).astype(bool) if dilations else mask > 0
 
 
-def _rays(sample: PixelSample, cam_from_object: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _rays(sample: PixelSample, cam_from_object: Transform) -> tuple[Points32, Directions32]:
     rotation = cam_from_object[:3, :3]
     origin = (-rotation.T @ cam_from_object[:3, 3]).astype(np.float32)
     directions = sample.directions @ rotation.astype(np.float32)
     return np.repeat(origin[None], len(directions), axis=0), directions
 
 
-def _through_rays(by_ray: np.ndarray, directions: np.ndarray, cam_from_object: np.ndarray) -> np.ndarray:
-    """From derivatives (n, k, 6) by origin and direction in the object to those by the left twist.
+def _through_rays(by_ray: Jacobians, directions: Directions32, cam_from_object: Transform) -> Jacobians:
+    """From derivatives by origin and direction in the object to those by the left twist.
 
     In the camera's axes all rays start at 0, and the object moving by a twist is the rays moving by its negative.
     """
@@ -149,8 +164,8 @@ def _through_rays(by_ray: np.ndarray, directions: np.ndarray, cam_from_object: n
     return -twist_gradient(np.zeros(3, np.float32), directions[:, None], in_cam)
 
 
-def _along_motion(sample: PixelSample, depth: np.ndarray) -> np.ndarray:
-    """Derivatives (n, k, 6) of rendered colours by the left twist, from the frame's slopes; 0 where nothing is hit.
+def _along_motion(sample: PixelSample, depth: Values32) -> Jacobians:
+    """Derivatives of rendered colours by the left twist, from the frame's slopes; 0 where nothing is hit.
 
     A surface point that a twist moves to the right brings the colour from its left; where frame and render agree,
     that is the frame's. Source: Lucas and Kanade (1981); Engel et al., Direct sparse odometry (2018), for the pose.

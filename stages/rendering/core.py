@@ -10,6 +10,7 @@ import numpy as np
 
 from fieldpose.bus.messages import Reason
 from fieldpose.stages.geometry import Camera, points_at_depth, viewing_angles
+from fieldpose.stages.geometry.arrays import Points64, Transform
 from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedView
 from fieldpose.stages.rendering.config import RenderingConfig
 
@@ -35,7 +36,7 @@ class ViewSource:
         self._renderer, self._config, self._field_id = renderer, config or RenderingConfig(), field_id
         self._cache: OrderedDict[str, _Cached] = OrderedDict()
 
-    def view(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool = False) -> SourcedView | Reason:
+    def view(self, camera: Camera, cam_from_object: Transform, next_pass: bool = False) -> SourcedView | Reason:
         """The view of a frame's camera (undistorted, shrunk) at the guess or near it; nearer in a next pass.
 
         NOTHING_IN_VIEW where it shows too little.
@@ -43,7 +44,7 @@ class ViewSource:
         found = self._found(camera, cam_from_object, next_pass)
         return found if found.visible >= self._config.min_visible else Reason.NOTHING_IN_VIEW
 
-    def _found(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool) -> SourcedView:
+    def _found(self, camera: Camera, cam_from_object: Transform, next_pass: bool) -> SourcedView:
         small = view_camera(camera, self._config.longer_side)
         view_id = _view_id(self._field_id, small, cam_from_object)
         found = view_id if view_id in self._cache else self._near(small, cam_from_object, next_pass)
@@ -56,7 +57,7 @@ class ViewSource:
         self._keep(view_id, cached)
         return SourcedView(view, view_id, False, cached.visible)
 
-    def _near(self, camera: Camera, cam_from_object: np.ndarray, next_pass: bool) -> str | None:
+    def _near(self, camera: Camera, cam_from_object: Transform, next_pass: bool) -> str | None:
         """The id of the cached view with the smallest shift among those within the limits."""
         if self._config.reuse_within_deg <= 0:
             return None
@@ -82,11 +83,11 @@ def view_camera(camera: Camera, size: int) -> Camera:
 
 @dataclass(frozen=True)
 class _Cached:
-    """A view, its visible share, and surface points in it: (n, 3) in object coordinates, float64."""
+    """A view, its visible share, and surface points in it, in object coordinates."""
 
     view: RenderedView
     visible: float
-    probes: np.ndarray
+    probes: Points64
 
     @property
     def size_bytes(self) -> int:
@@ -94,7 +95,7 @@ class _Cached:
         return view.rgb.nbytes + view.depth.nbytes + view.opacity.nbytes + self.probes.nbytes
 
 
-def _probes(view: RenderedView) -> np.ndarray:
+def _probes(view: RenderedView) -> Points64:
     surface = np.flatnonzero((view.opacity > 0.5) & (view.depth > 0))
     chosen = surface[np.linspace(0, len(surface) - 1, min(_PROBES, len(surface))).astype(int)]
     y, x = np.divmod(chosen, view.camera.width)
@@ -102,7 +103,7 @@ def _probes(view: RenderedView) -> np.ndarray:
     return points.astype(np.float64)
 
 
-def _difference(cached: _Cached, cam_from_object: np.ndarray) -> tuple[float, float]:
+def _difference(cached: _Cached, cam_from_object: Transform) -> tuple[float, float]:
     """How differently a guess sees the surface points of a cached view; infinite if it has none of them in front.
 
     The median angle in degrees between the directions in which they are seen, and the root mean square shift of
@@ -117,7 +118,7 @@ def _difference(cached: _Cached, cam_from_object: np.ndarray) -> tuple[float, fl
     return float(np.rad2deg(np.median(viewing_angles(cached.probes, old, cam_from_object)))), float(shift)
 
 
-def _view_id(field_id: str, camera: Camera, cam_from_object: np.ndarray) -> str:
+def _view_id(field_id: str, camera: Camera, cam_from_object: Transform) -> str:
     digest = hashlib.sha256(f"{field_id} {camera}".encode())
     digest.update(np.ascontiguousarray(cam_from_object, dtype="<f8").tobytes())
     return digest.hexdigest()[:16]

@@ -12,7 +12,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float32, Int8
 
+from fieldpose.stages.geometry.arrays import Image, Indices, Values32
 from fieldpose.stages.images import shrunk
 from fieldpose.stages.matching.core import MatchingConfig
 from fieldpose.stages.nerf.field import DESCRIPTOR_SIZE
@@ -27,28 +29,30 @@ _AT_ONCE = 1024
 _ROUGH, _LIKELY = 32, 32
 """So many keypoints of each view tell which views, so many at least, are worth a look at all of theirs."""
 
-Describe = Callable[[np.ndarray], np.ndarray]
-"""An image (h, w, 3) uint8 -> its strongest keypoints' unit descriptors (n, 64) float32, the strongest first."""
+Descriptors = Float32[np.ndarray, "_ 64"]
+Memory = Int8[np.ndarray, "views keypoints 64"]
+Describe = Callable[[Image], Descriptors]
+"""An image -> its strongest keypoints' unit descriptors, the strongest first."""
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """index: (m,) of the training views, the most alike first.  similarity: (m,) float32, 0 to 1."""
+    """index: of the training views, the most alike first.  similarity: 0 to 1."""
 
-    index: np.ndarray
-    similarity: np.ndarray
+    index: Indices
+    similarity: Values32
 
 
 class Retriever:
-    """Compares frames with training views, of which it is given the descriptors (views, keypoints, 64) int8."""
+    """Compares frames with training views, of which it is given the descriptors."""
 
-    def __init__(self, descriptors: np.ndarray, config: RetrievalConfig | None = None) -> None:
+    def __init__(self, descriptors: Memory, config: RetrievalConfig | None = None) -> None:
         self._config = config or RetrievalConfig()
         self._views = np.ascontiguousarray(descriptors, np.float32) / _UNIT
         self._rough = np.ascontiguousarray(self._views[:, :_ROUGH])
 
-    def rank(self, frame: np.ndarray) -> Ranking:
-        """The training views that resemble a frame by its descriptors (n, 64), as many as the configuration says."""
+    def rank(self, frame: Descriptors) -> Ranking:
+        """The training views that resemble a frame by its descriptors, as many as the configuration says."""
         candidates, frame = self._config.candidates, np.ascontiguousarray(frame[: self._config.keypoints], np.float32)
         if len(frame) == 0:
             return Ranking(np.zeros(0, np.int64), np.zeros(0, np.float32))
@@ -58,8 +62,10 @@ class Retriever:
         best = best[similarity[best] > 0]
         return Ranking(likely[best], similarity[best])
 
-    def _similarity(self, views: np.ndarray, frame: np.ndarray) -> np.ndarray:
-        """Of views (v, keypoints, 64) to a frame (n, 64): (v,) float32."""
+    def _similarity(
+        self, views: Float32[np.ndarray, "views keypoints 64"], frame: Descriptors
+    ) -> Float32[np.ndarray, " views"]:
+        """Of views to a frame."""
         similarity = np.empty(len(views), np.float32)
         at_once = max(1, _AT_ONCE // max(1, views.shape[1]))
         for first in range(0, len(views), at_once):
@@ -80,16 +86,16 @@ def describer(matching: MatchingConfig, longer_side: int, keypoints: int = _REME
         )
     )
 
-    def describe(image: np.ndarray) -> np.ndarray:
+    def describe(image: Image) -> Descriptors:
         features = extractor.extract(shrunk(image, longer_side))
-        descriptors: np.ndarray = features.data.cpu().numpy()
+        descriptors: Descriptors = features.data.cpu().numpy()
         return descriptors
 
     return describe
 
 
-def remembered(descriptors: Iterable[np.ndarray]) -> np.ndarray:
-    """What a field keeps of its training views: of each (n, 64) the first, in (views, keypoints, 64) int8."""
+def remembered(descriptors: Iterable[Descriptors]) -> Memory:
+    """What a field keeps of its training views: of each the first."""
     views = []
     for described in descriptors:
         strongest, view = described[:_REMEMBERED], np.zeros((_REMEMBERED, DESCRIPTOR_SIZE), np.int8)

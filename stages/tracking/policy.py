@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-import numpy as np
-
 from fieldpose.bus.messages import CameraOrigin, GuessReason, Reason, TrackingState
 from fieldpose.stages.geometry import Camera
+from fieldpose.stages.geometry.arrays import Covariance, Transform
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,7 @@ class PoseGuess:
     """A pose to render; `epoch` tells guesses made before a loss or a recovery from those made after."""
 
     reason: GuessReason
-    cam_from_object: np.ndarray
+    cam_from_object: Transform
     epoch: int = 0
 
 
@@ -38,9 +37,9 @@ class Look:
 
 @dataclass(frozen=True)
 class Alike:
-    """cam_from_object (4, 4) of training views that look like a frame, the most alike first, or why there are none."""
+    """cam_from_object of training views that look like a frame, the most alike first, or why there are none."""
 
-    poses: Sequence[np.ndarray] = ()
+    poses: Sequence[Transform] = ()
     reason: Reason | None = None
 
 
@@ -50,8 +49,8 @@ class PoseResult:
 
     frame_id: int
     pass_index: int
-    cam_from_object: np.ndarray | None = None
-    covariance: np.ndarray | None = None
+    cam_from_object: Transform | None = None
+    covariance: Covariance | None = None
     inliers: int = 0
     correspondences: int = 0
     residual_px: float | None = None
@@ -98,8 +97,8 @@ class Belief:
 
     state: TrackingState
     score: float
-    cam_from_object: np.ndarray | None = None
-    covariance: np.ndarray | None = None
+    cam_from_object: Transform | None = None
+    covariance: Covariance | None = None
     reason: Reason | None = None
 
 
@@ -110,7 +109,7 @@ Step = PoseGuess | Look
 class Policy(Protocol):
     """Makes the guesses and judges the results; the Tracker keeps the door and the clock."""
 
-    def on_prior(self, frame_id: int, cam_from_object: np.ndarray) -> None:
+    def on_prior(self, frame_id: int, cam_from_object: Transform) -> None:
         """A guess of a frame's pose has come from outside, before the frame or after."""
         ...
 

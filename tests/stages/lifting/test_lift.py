@@ -103,7 +103,7 @@ def test_a_point_that_few_views_see_otherwise_is_only_blamed_by_the_mean() -> No
 
     class Wall:
         def render_rays(self, origins: np.ndarray, directions: np.ndarray) -> RenderedRays:
-            depth = (3.0 - origins[:, 2]) / directions[:, 2]
+            depth = ((3.0 - origins[:, 2]) / directions[:, 2]).astype(np.float32)
             depth[::6] *= 0.5
             return RenderedRays(np.zeros((len(depth), 3), np.float32), depth, np.ones_like(depth))
 

@@ -186,7 +186,9 @@ def _timed(sender: str, outputs: Iterable[Output]) -> Iterator[Said]:
 
 def _found(said: Sequence[Said]) -> PoseFound:
     messages = [one.message for one in said]
-    state = next(message for message in messages if isinstance(message, State))
+    state = next((message for message in messages if isinstance(message, State)), None)
+    if state is None:  # there is nothing to begin with, so that tracking waits for a guess
+        return PoseFound(Reason.NO_GUESS, passes=0)
     passes = sum(isinstance(message, Guess) for message in messages)
     stage_ms: dict[str, float] = {}
     for one in said:

@@ -85,7 +85,7 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     threads = options.threads or threads_of(row, plan.in_flight)
     os.environ.update(thread_environment(threads))
     parts = Parts(plan, threads)
-    if options.field is not None and row.renders:
+    if options.field is not None and row.renders and plan.settings.backend == "numba":
         compile_kernels(options.field, row.name)
     address = settings.address
     bus = ZenohBus(options.connect, options.listen or peer_address(options.connect))

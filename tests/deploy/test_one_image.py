@@ -200,3 +200,9 @@ def test_estimates_mistakes_are_one_line(arguments: list[str], said: str, capsys
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     assert said in lines[0]
+
+
+def test_a_finder_with_nothing_to_begin_with_says_so(scene: AnalyticScene) -> None:
+    finder, image = photo_finder(SETTINGS, NO_VIEWS, scene), scene.render_view(camera(120), viewpoint()).rgb
+    assert finder.find(image, camera(120)).reason is Reason.NO_GUESS
+    assert finder.find(image, camera(120), viewpoint(2.0)).ok

@@ -49,9 +49,9 @@ class _Waiting:
 class Joiner:
     """The first input drives: each of its messages comes out once, joined or, after `timeout_s`, incomplete.
 
-    The other inputs wait for it in rings. What there is one of a frame is joined by its id alone and stays in its
-    ring, for later passes. The capture time belongs to the key, so that frames of a camera that started again are not
-    mixed up.
+    The other inputs wait for it in rings. What there is one of a frame is joined without regard to the pass, and stays
+    in its ring for later ones. The capture time belongs to the key, so that frames of a camera that started again are
+    not mixed up.
     """
 
     def __init__(self, inputs: tuple[Topic[Any], ...], timeout_s: float = 1.0) -> None:

@@ -127,7 +127,7 @@ class Inbox:
         ]
 
     def get(self, timeout_s: float) -> Received | None:
-        """The oldest message, waiting up to `timeout_s` for one; None after that, or when `wake` was called."""
+        """The oldest message, waiting up to `timeout_s` for one; None after that."""
         deadline = time.monotonic() + timeout_s
         while True:
             item = self._take(max(0.0, deadline - time.monotonic()))
@@ -140,11 +140,6 @@ class Inbox:
     def drain(self) -> list[Received]:
         """Every message that is here now."""
         return list(iter(lambda: self.get(0.0), None))
-
-    def wake(self) -> None:
-        """Let a waiting `get` return at once."""
-        with self._arrived:
-            self._arrived.notify_all()
 
     def close(self) -> None:
         for subscription in self._subscriptions:

@@ -30,6 +30,7 @@ from fieldpose.deploy.graph import CAMERA, HUB, RECORDER, Launch, rows_of
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import resolve
 from fieldpose.deploy.settings import Settings
+from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 from fieldpose.stages.nerf.training_views import TrainingViews
@@ -112,10 +113,13 @@ class PoseFound:
 class PoseFinder:
     """Finds the pose of single images: renders, matches, lifts, solves and refines, until a pose is believed.
 
-    `views` are the field's training views. Raises FieldFileError, ConfigError and WeightsError.
+    Raises FieldFileError, ConfigError and WeightsError.
     """
 
     def __init__(self, parts: Parts) -> None:
+        if parts.plan.begins.by_frame:
+            guess = parts.settings.tracking.guess
+            raise ConfigError(f"guess {guess}: tells of frames; for an image give train:NAME or a file with one pose")
         self._parts = parts
         self._pipeline = LocalPipeline(parts)
         self._images = 0

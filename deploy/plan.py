@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Literal
 
 from fieldpose.deploy.settings import Settings
+from fieldpose.errors import ConfigError
 from fieldpose.stages.camera.config import CameraConfig
-from fieldpose.stages.camera.sources import is_video
+from fieldpose.stages.camera.sources import is_video, knows_truth
 from fieldpose.stages.nerf.backend import resolved
 from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.refinement.config import RefinementConfig
 from fieldpose.stages.rendering.config import RenderingConfig
-from fieldpose.stages.tracking.beginning import Beginning, beginning
+from fieldpose.stages.tracking.beginning import Beginning, absolute, beginning
 
 VIDEO_VIEW_SIZE, PHOTO_VIEW_SIZE = 256, 400
 """On lego a view of 256 pixels takes half the time of one of 400, and one step from it errs nearly twice as much."""
@@ -25,7 +26,7 @@ Sequence = Literal["video", "photos"]
 
 @dataclass(frozen=True)
 class Plan:
-    """A pipeline to be run: its field, and settings without any "auto".
+    """A pipeline to be run: its field, and settings with nothing left open but the pace of a source that is elsewhere.
 
     looks: whether retrieval can be asked. notes: what was decided, and why, by name.
     """
@@ -56,6 +57,10 @@ def resolve(settings: Settings, views: TrainingViews | None, field: Path | None 
     notes: dict[str, str] = {}
     sequence = _sequence(settings, notes)
     begins = beginning(settings.tracking.guess, views)
+    if begins.disturbance is not None and settings.camera.source and not knows_truth(settings.camera.source):
+        raise ConfigError(
+            f"guess {settings.tracking.guess}: is made from true poses, which {settings.camera.source} does not know"
+        )
     looks = _looks(settings, views, begins, notes)
     backend = resolved(settings.backend)
     notes["backend"] = f"{backend}{' (auto)' if settings.backend == 'auto' else ''}"
@@ -63,7 +68,7 @@ def resolve(settings: Settings, views: TrainingViews | None, field: Path | None 
         settings,
         backend=backend,
         camera=_camera(settings.camera, notes),
-        tracking=replace(settings.tracking, sequence=sequence),
+        tracking=replace(settings.tracking, sequence=sequence, guess=absolute(settings.tracking.guess)),
         rendering=_rendering(settings.rendering, sequence, sequence == "photos" or begins.by_frame, notes),
         matching=replace(settings.matching, device=_device(settings.matching.device, backend)),
         refinement=_refinement(settings.refinement, sequence, notes),

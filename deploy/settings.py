@@ -49,9 +49,9 @@ class Settings:
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
 
 
-def read_settings(path: Path | None) -> Settings:
+def read_settings(path: str | Path | None) -> Settings:
     """The defaults, changed by a file where one is given. Raises ConfigError that names the file and the key."""
-    return Settings() if path is None else changed(Settings(), read_file(path), str(path))
+    return Settings() if path is None else changed(Settings(), read_file(Path(path)), str(path))
 
 
 def read_file(path: Path) -> dict[str, Any]:
@@ -116,7 +116,8 @@ def overridden(config: T, **values: object) -> T:
 
 def to_json(settings: Settings) -> bytes:
     """Every setting with its value, as a file that `read_settings` takes."""
-    return msgspec.json.format(msgspec.json.encode(settings, enc_hook=str), indent=2) + b"\n"
+    # Python's own JSON has infinity, which some settings may be.
+    return json.dumps(msgspec.to_builtins(settings, enc_hook=str), indent=2).encode() + b"\n"
 
 
 def _converted(value: Any, wanted: Any, where: str) -> Any:

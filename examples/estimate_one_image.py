@@ -3,13 +3,11 @@
 import sys
 
 import numpy as np
-from PIL import Image
 
 import fieldpose
 
 
-def main(field: str, path: str) -> int:
-    image = np.array(Image.open(path).convert("RGB"))
+def main(field: str, image: str) -> int:
     with fieldpose.PoseFinder(field) as finder:
         found = finder.find(image)
     if found.cam_from_object is None:
@@ -23,4 +21,4 @@ def main(field: str, path: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    sys.exit(main(*sys.argv[1:]) if len(sys.argv) == 3 else __doc__)

@@ -19,6 +19,8 @@ RATE_HZ = 10.0
 def main(source: str, camera_file: str, hub: str = "tcp/127.0.0.1:7447") -> int:
     camera = msgspec.json.decode(Path(camera_file).read_bytes(), type=fieldpose.Camera)
     capture = cv2.VideoCapture(source)
+    if not capture.isOpened():
+        sys.exit(f"{source}: cannot be opened")
     with fieldpose.connect(hub) as pipeline:
         read, bgr = capture.read()
         while read:
@@ -30,4 +32,4 @@ def main(source: str, camera_file: str, hub: str = "tcp/127.0.0.1:7447") -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    sys.exit(main(*sys.argv[1:]) if len(sys.argv) in (3, 4) else __doc__)

@@ -6,7 +6,7 @@ Poses are 4x4 float64 `cam_from_object` matrices in OpenCV camera axes (x right,
     finder = fieldpose.PoseFinder("mine.safetensors")       # a field of `fieldpose train`
     found = finder.find(image)                              # found.cam_from_object, found.covariance, found.reason
 
-    with fieldpose.connect() as pipeline:                   # a pipeline of `fieldpose run` or `fieldpose stage`
+    with fieldpose.connect() as pipeline:                   # of `fieldpose run … --listen tcp/127.0.0.1:7447`
         for state in pipeline.states():
             print(state.state, state.cam_from_object)
 
@@ -19,6 +19,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from os import PathLike
+
     from fieldpose.bus.messages import CameraOrigin, Reason, State, TrackingState
     from fieldpose.connection import Connection, connect
     from fieldpose.deploy.local import PoseFound
@@ -58,8 +60,8 @@ __all__ = [
 ]  # fmt: skip
 
 
-def load_field(path: Any) -> Field:
-    """A trained field from its file (str or Path). Raises FieldposeError."""
+def load_field(path: str | PathLike[str]) -> Field:
+    """A trained field from its file. Raises FieldposeError."""
     from pathlib import Path
 
     from fieldpose.stages.nerf.field import load_field as load

@@ -14,7 +14,10 @@ from fieldpose.bus.ports import Inbox, Outbox, first_header
 from fieldpose.bus.topics import CAMERA_INFO, FRAME, PRIOR, STATE, Address
 from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
 from fieldpose.deploy.processes.endpoints import peer_address
-from fieldpose.stages.geometry import Camera
+from fieldpose.errors import GeometryError
+from fieldpose.stages.geometry import Camera, is_rigid
+from fieldpose.stages.images import checked_image
+from fieldpose.stages.tracking.wire import RIGID_TOLERANCE
 
 _POLL_S = 0.1
 _KEPT_STATES = 1024
@@ -55,6 +58,8 @@ class Connection:
 
         camera: of this image. capture_ns: when it was taken, since the epoch (default: now); motion is judged by it.
         """
+        if encoding == "rgb8":
+            checked_image(image)
         frame_id = self._frames if frame_id is None else frame_id
         self._frames = frame_id + 1
         header = first_header(frame_id, time.time_ns() if capture_ns is None else capture_ns)
@@ -68,6 +73,8 @@ class Connection:
     def publish_prior(self, frame_id: int, cam_from_object: np.ndarray) -> None:
         """Send a guess of a frame's pose (4, 4), from a robot arm's kinematics for instance, before that frame."""
         pose = np.array(cam_from_object, np.float64)
+        if not is_rigid(pose, RIGID_TOLERANCE):
+            raise GeometryError(f"a prior must be a rigid (4, 4) cam_from_object, got {pose.tolist()}")
         self._outbox.publish(PRIOR, Prior(header=first_header(frame_id, time.time_ns()), cam_from_object=pose))
 
     def close(self) -> None:

@@ -14,10 +14,14 @@ from fieldpose.deploy.local import PoseFound
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import resolve
 from fieldpose.deploy.settings import Settings
+from fieldpose.errors import GeometryError
 from fieldpose.stages.camera.calibration import Calibrator
-from fieldpose.stages.geometry import Camera
+from fieldpose.stages.geometry import Camera, is_rigid
+from fieldpose.stages.images import checked_image
+from fieldpose.stages.nerf.datasets.images import load_photo
 from fieldpose.stages.nerf.field import load_field
 from fieldpose.stages.nerf.training_views import training_views
+from fieldpose.stages.tracking.wire import RIGID_TOLERANCE
 
 
 class PoseFinder:
@@ -36,17 +40,26 @@ class PoseFinder:
         self._calibrator = Calibrator(settings.camera, self._parts.known_cameras())
         self._finder = PartsFinder(self._parts)
 
-    def find(self, image: np.ndarray, camera: Camera | None = None, guess: np.ndarray | None = None) -> PoseFound:
-        """The pose of an image (h, w, 3) uint8 RGB, or the reason why there is none.
+    def find(
+        self, image: np.ndarray | str | Path, camera: Camera | None = None, guess: np.ndarray | None = None
+    ) -> PoseFound:
+        """The pose of an image, or the reason why there is none.
 
-        camera: of the image; without it the training views' camera where the shape is theirs, else an assumed field of
-        view, by which no pose is sure (`state` is LIMITED and the covariance large). guess: a cam_from_object (4, 4)
-        to begin with; without it, the training views that look like the image.
+        image: (h, w, 3) uint8 RGB, or an image file, whose EXIF may tell of its lens. camera: of the image; without it
+        the training views' camera where the shape is theirs, else EXIF's focal length, else an assumed field of view,
+        by which no pose is sure (`state` is LIMITED and the covariance large). guess: a cam_from_object (4, 4) to begin
+        with; without it, the training views that look like the image. Raises FieldposeError for what is no image, or
+        no rigid guess.
         """
-        if camera is None:
-            calibration = self._calibrator.of(image.shape[1], image.shape[0])
-            return self._finder.find(image, calibration.camera, guess, calibration.origin)
-        return self._finder.find(image, camera, guess, CameraOrigin.CALIBRATED)
+        if guess is not None and not is_rigid(guess, RIGID_TOLERANCE):
+            raise GeometryError(f"a guess must be a rigid (4, 4) cam_from_object, got {np.asarray(guess).tolist()}")
+        path = None if isinstance(image, np.ndarray) else Path(image)
+        pixels = image if isinstance(image, np.ndarray) else load_photo(Path(image))
+        checked_image(pixels)
+        if camera is not None:
+            return self._finder.find(pixels, camera, guess, CameraOrigin.CALIBRATED)
+        calibration = self._calibrator.of(pixels.shape[1], pixels.shape[0], path)
+        return self._finder.find(pixels, calibration.camera, guess, calibration.origin)
 
     def close(self) -> None:
         """Let go of what is held."""

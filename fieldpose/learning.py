@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,11 +18,13 @@ def train(
     """Learn a field from a folder of posed images, as `fieldpose train` does, and save it at `out` (.safetensors).
 
     size: the longer side in pixels to which images are shrunk. report: called a few times a second with the share of
-    the time that is over and the PSNR (dB) of the last batches. The field knows how its training views look, and how
-    exactly they are found in it (`field.metadata.accuracy`). Raises FieldposeError for a dataset that cannot be used.
+    the time that is over and the PSNR (dB) of the last batches. Where the weights of XFeat are installed the field
+    knows how its training views look, and how exactly they are found in it (`field.metadata.accuracy`); else a warning
+    says so. Raises FieldposeError for a dataset that cannot be used.
     """
     trained = learn_field(
         Path(dataset), Path(out), size, "auto", TrainingConfig(minutes=minutes, seed=seed), FieldConfig(),
         report=lambda state: report(state.progress.fraction, state.progress.train_psnr_db),
+        say=lambda text: warnings.warn(text, stacklevel=4),
     )  # fmt: skip
     return trained.field

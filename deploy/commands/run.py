@@ -31,7 +31,7 @@ class Options:
     --guess perturb:10-40deg,0.2 --record out/lego.mcap --json out/lego.json
 
     Ctrl-C ends the run and leaves a finished recording. What the keys of the JSON file mean stands in
-    deploy/results.py.
+    deploy/reporting/results.py.
     """
 
     field: tyro.conf.Positional[Path]

@@ -15,7 +15,18 @@ import tyro
 from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.node import Handler, run_node
 from fieldpose.bus.transport import LOCAL_HUB, ZenohBus, log_to_stderr, serve_hub, wait_for
-from fieldpose.deploy.graph import BY_NAME, CAMERA, GRAPH, STAGES, Launch, Process, thread_environment, threads_of
+from fieldpose.deploy.graph import (
+    AT_WORK,
+    BY_NAME,
+    CAMERA,
+    GRAPH,
+    STAGES,
+    Launch,
+    Process,
+    rows_of,
+    thread_environment,
+    threads_of,
+)  # fmt: skip
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan, resolve
 from fieldpose.deploy.processes.endpoints import peer_address
@@ -32,6 +43,7 @@ _START_S = 300.0
 
 _Name = Annotated[str, tyro.conf.arg(constructor=tyro.extras.literal_type_from_choices(list(BY_NAME)))]
 _WITH_FIELD = ", ".join(row.name for row in GRAPH if row.needs_field)
+_FIELD = f"The field, for {_WITH_FIELD}, and for the camera, which looks there for cameras that are not calibrated."
 
 
 @dataclass(frozen=True)
@@ -48,15 +60,14 @@ class Options:
     listen: str | None = None
     """Where this process listens: the hub for everybody (default: the address of --connect), any other for the
     processes that it exchanges messages with (default: any port, for this machine alone if the hub is on it)."""
-    field: Annotated[Path | None, tyro.conf.arg(help=f"The field, for the processes that need it: {_WITH_FIELD}.")] = (
-        None
-    )
+    field: Annotated[Path | None, tyro.conf.arg(help=_FIELD)] = None
     record: Path | None = None
     """The recorder's file (.mcap)."""
     threads: int | None = None
-    """Threads that it may use (default: by the process table)."""
-    wait_for: tuple[str, ...] = ()
-    """Processes that must be ready before this one begins; the camera sends nothing before they are."""
+    """Threads that it may use (default: by the graph)."""
+    wait_for: tuple[str, ...] | None = None
+    """Processes that must be ready before this one begins (default: none, and for the camera, which sends nothing
+    before they are, all that its frames pass)."""
     config: Path | None = None
     """TOML or JSON file of settings."""
     settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
@@ -88,14 +99,17 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     if options.field is not None and row.renders and plan.settings.backend == "numba":
         compile_kernels(options.field, row.name)
     address = settings.address
+    # In whatever order they are started, the first frame finds all that work on it.
+    passed = tuple(other.name for other in rows_of(plan, recorded=False) if other.name in AT_WORK)
+    awaited = options.wait_for if options.wait_for is not None else passed if row.name == CAMERA else ()
     bus = ZenohBus(options.connect, options.listen or peer_address(options.connect))
     _tell(plan, row)
 
     def wait_until_ready() -> None:
-        wait_for(bus, address, options.wait_for, _START_S)
+        wait_for(bus, address, awaited, _START_S)
 
     # The camera waits for the stages once it is at work; those that listen are to get its very first message.
-    first = options.wait_for if row.name != CAMERA else [name for name in options.wait_for if name not in STAGES]
+    first = awaited if row.name != CAMERA else tuple(name for name in awaited if name not in STAGES)
 
     try:
         handler = make(parts, Launch(bus, options.record, wait_until_ready))

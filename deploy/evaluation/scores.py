@@ -8,7 +8,7 @@ The keys of a method's scores, which programs may rely on:
   share_ok_right     of these, the ones with both errors below their limits
   mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te   over the pairs with a pose; null without any
   seconds_per_image  mean, all passes and refinement included
-  stage_ms           {stage: mean}, of the pass that counts, over the pairs with a pose, 0 where one did without the
+  stage_ms           {stage: mean}, of all passes, over the pairs with a pose, 0 where one did without the
                      stage; null for a published method, and without any pose
   covariance         {50, 90, 99}: share of the true poses inside the ellipsoid of that probability; null without any
   add                {diameter, add_below_0.1d, add_s_below_0.1d, auc_add, auc_add_s}: see deploy.evaluation.surface;

@@ -50,7 +50,7 @@ class Collector:
         self.observed: Counter[str] = Counter()
         self.sent = 0
         self._numbers = Sequences(from_start=True)
-        self._frames: OrderedDict[int, _Seen] = OrderedDict()
+        self._frames: OrderedDict[tuple[int, int], _Seen] = OrderedDict()
         self._headers: deque[tuple[Topic[Any], Header]] = deque()
         self._reported_ns: deque[int] = deque()
         self._inbox = Inbox(bus, address, _READ, dict.fromkeys(_READ, _CAPACITY))
@@ -73,7 +73,7 @@ class Collector:
 
     def results(self) -> list[FrameResult]:
         """What became of each frame that the camera has sent, oldest first."""
-        return [_result(frame_id, seen) for frame_id, seen in sorted(self._frames.items())]
+        return [_result(frame_id, self._frames[at_ns, frame_id]) for at_ns, frame_id in sorted(self._frames)]
 
     def rate_hz(self, now_ns: int) -> float:
         """Frames that tracking has reported on in the last seconds."""
@@ -111,9 +111,11 @@ class Collector:
                 self._seen(message.header).truth = message
 
     def _seen(self, header: Header) -> _Seen:
-        seen = self._frames.get(header.frame_id)
+        # The capture time tells a camera's frames from those of one that began again.
+        key = (header.capture_ns, header.frame_id)
+        seen = self._frames.get(key)
         if seen is None:
-            seen = self._frames[header.frame_id] = _Seen(header.capture_ns)
+            seen = self._frames[key] = _Seen(header.capture_ns)
             if len(self._frames) > _FRAMES_KEPT:
                 self._frames.popitem(last=False)
         return seen

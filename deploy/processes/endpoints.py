@@ -26,11 +26,12 @@ def check_free(listen: str | None) -> None:
     found = None if listen is None else _TCP.fullmatch(listen)
     if found is None:
         return
-    with socket.socket() as probe:
+    host = found["host"].strip("[]")
+    with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET) as probe:
         # As the hub does; else a port would count as used for a minute after the last one.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((found["host"], int(found["port"])))
+            probe.bind((host, int(found["port"])))
         except (OSError, OverflowError) as error:
             reason = "the port is in use" if getattr(error, "errno", 0) == errno.EADDRINUSE else str(error)
             raise TransportError(f"cannot listen on {listen}: {reason}; choose another with --listen") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sys
 import tempfile
@@ -34,7 +35,8 @@ from fieldpose.deploy.processes.endpoints import check_free, free_port, peer_add
 from fieldpose.deploy.processes.supervision import Program, Supervisor
 from fieldpose.deploy.reporting.results import RunResult
 from fieldpose.deploy.settings import to_json
-from fieldpose.errors import ProcessError, RecordingError
+from fieldpose.errors import OutputError, ProcessError, RecordingError
+from fieldpose.stages.camera.sources import EXTERNAL
 
 _START_S = 300.0
 _RESTARTS_AT_START, _RESTARTS = 2, 10
@@ -130,7 +132,8 @@ class _Running:
             collector = Collector(bus, self._plan.settings.address)
             token = bus.hold(self._plan.settings.address.live(OBSERVER))
             start_s = self._start(bus, collector) - began
-            finished = self._watch(collector)
+            # Where other programs send the frames, it is Ctrl-C that ends the source.
+            finished = self._watch(collector) or self._plan.settings.camera.source == EXTERNAL
             self._finish(collector, finished)
             token.close()
             collector.close()
@@ -226,7 +229,12 @@ def _recording(path: Path | None, supervisor: Supervisor) -> RecordingInfo | Non
 def _folder(kept: Path | None) -> Iterator[Path]:
     """A folder for what the processes need and say; one that was not asked for is kept only if they fail."""
     if kept is not None:
-        kept.mkdir(parents=True, exist_ok=True)
+        try:
+            kept.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{kept}: no folder for logs can be made there: {error.strerror}") from error
+        if not os.access(kept, os.W_OK):
+            raise OutputError(f"{kept}: no right to write logs there")
         yield kept
         return
     folder = Path(tempfile.mkdtemp(prefix="fieldpose-"))

@@ -24,7 +24,7 @@ def compile_kernels(field: Path, process: str) -> None:
 
     with one_at_a_time():
         began = time.monotonic()
-        warm_up(load_renderer(field))
+        warm_up(load_renderer(field, backend="numba"))
         seconds = time.monotonic() - began
     if seconds > _WORTH_TELLING_S:
         stage_logger(process).info("compiled the kernels, for this and the next start", seconds=round(seconds, 1))

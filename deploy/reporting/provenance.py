@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import platform
 from functools import cache
 from importlib import metadata as packages
 from pathlib import Path
-
-import msgspec
 
 from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.recording import Metadata
@@ -51,7 +50,7 @@ def recorded_settings(path: Path) -> Settings:
 
     Raises RecordingError where the recording has none.
     """
-    content = msgspec.json.decode(read_attachment(path, SETTINGS_ATTACHMENT))
+    content = json.loads(read_attachment(path, SETTINGS_ATTACHMENT))
     gone = without_unknown(Settings(), content)
     if gone:
         stage_logger("replay").warning("settings of another version are left out", names=", ".join(gone))

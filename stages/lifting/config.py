@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from fieldpose.stages.checks import refuse_below
+
 
 @dataclass(frozen=True)
 class LiftingConfig:
@@ -28,6 +30,12 @@ class LiftingConfig:
     """pixel: what one pixel of the view covers at the point's depth; field: the field's own length unit"""
     min_kept: int = 6
     """fewer consistent points than this are reported as a failure"""
+
+    def __post_init__(self) -> None:
+        refuse_below(
+            "lifting", self, {"views": 0, "angle_deg": 0, "gamma": 0, "enough": 0, "gamma_most": 0, "min_kept": 0}
+        )
+
 
 MIN_OPACITY = 0.5
 """A pixel that is more transparent shows no surface."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from fieldpose.stages.checks import refuse_below
+
 
 @dataclass(frozen=True)
 class RefinementConfig:
@@ -37,6 +39,9 @@ class RefinementConfig:
 
     seed: int = 0
     """Of the choice of pixels."""
+
+    def __post_init__(self) -> None:
+        refuse_below("refinement", self, {"steps": 0, "dilations": 0, "samples": 1, "held_out": 0, "size": 1})
 
     @property
     def on(self) -> bool:

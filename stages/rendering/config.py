@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from fieldpose.stages.checks import refuse_below
+
 _DEFAULT_SIZE = 400
 
 
@@ -24,6 +26,11 @@ class RenderingConfig:
     """a next pass over the same frame wants a view that is nearer than the last: its share of the two limits"""
     cache_mb: float = 64.0
     """memory for cached views; the longest unused ones are forgotten"""
+
+    def __post_init__(self) -> None:
+        refuse_below(
+            "rendering", self, {"size": 0, "min_visible": 0, "reuse_shift": 0, "next_pass_share": 0, "cache_mb": 0}
+        )
 
     @property
     def reuse_within_deg(self) -> float:

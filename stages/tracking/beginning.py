@@ -69,6 +69,13 @@ def beginning(spec: str | None, views: TrainingViews | None) -> Beginning:
     return Beginning(content.start, content.frames)
 
 
+def absolute(spec: str | None) -> str | None:
+    """The same, with the whole path of a file, so that it is found from other folders too."""
+    if spec is None or spec.startswith(("perturb:", "train:")):
+        return spec
+    return str(Path(spec).resolve())
+
+
 def make_policy(config: TrackingConfig, views: TrainingViews, looks: bool = False) -> Policy:
     """The policy for the configured sequence and guess; `looks`: whether retrieval can be asked. Raises ConfigError."""
     begins = beginning(config.guess, views)

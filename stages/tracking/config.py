@@ -36,7 +36,7 @@ class ScoreConfig:
     good_inlier_ratio: float = 0.55
     """Of the points that were looked for, matched ones and landmarks, those found where the pose puts them."""
     good_residual_px: float = 2.0
-    """Median reprojection error of the inliers."""
+    """Root mean square of the inliers' reprojection errors."""
     good_sigma: Limit = Limit(1.0, 0.02)
     """Standard deviations of rotation and translation, from the covariance of the pose; x scale."""
     usable: float = 0.2

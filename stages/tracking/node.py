@@ -6,12 +6,14 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from fieldpose.bus.logs import Throttle, stage_logger
 from fieldpose.bus.messages import CameraInfo, Failure, Message, Pose, Prior, Retrieved
 from fieldpose.bus.node import Output
 from fieldpose.bus.ports import Sequences
 from fieldpose.bus.topics import CAMERA_INFO, FAILURE, GUESS, POSE, PRIOR, RETRIEVED, SEARCH, STATE, Topic
+from fieldpose.stages.geometry import is_rigid
 from fieldpose.stages.tracking import core
-from fieldpose.stages.tracking.wire import alike, copied, failed, frame_info, outputs_of, pose_result
+from fieldpose.stages.tracking.wire import RIGID_TOLERANCE, alike, copied, failed, frame_info, outputs_of, pose_result
 
 
 class TrackingNode:
@@ -24,6 +26,7 @@ class TrackingNode:
     def __init__(self, make_tracker: Callable[[], core.Tracker]) -> None:
         self._make_tracker = make_tracker
         self._sequences = Sequences()
+        self._throttle = Throttle(stage_logger(self.name))
 
     def start(self) -> None:
         self._tracker = self._make_tracker()
@@ -43,7 +46,11 @@ class TrackingNode:
             case CameraInfo():
                 return tracker.on_frame(frame_info(message), now_ns, self._sequences.seen(CAMERA_INFO.name, header))
             case Prior():
-                return tracker.on_prior(header.frame_id, copied(message.cam_from_object), now_ns)
+                pose = copied(message.cam_from_object)
+                if not is_rigid(pose, RIGID_TOLERANCE):
+                    self._throttle.warning("a prior that is no rigid transform", frame=header.frame_id)
+                    return []
+                return tracker.on_prior(header.frame_id, pose, now_ns)
             case Retrieved() | Failure(stage="retrieval"):
                 return tracker.on_alike(header.frame_id, alike(message), now_ns)
             case Pose():

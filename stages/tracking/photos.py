@@ -17,6 +17,9 @@ from fieldpose.stages.tracking.priors import Priors
 from fieldpose.stages.tracking.scoring import believed, score
 from fieldpose.stages.tracking.search import farthest_point_order, nearest_first
 
+_HOPELESS = (Reason.FRAME_UNREADABLE, Reason.FRAME_MISSING)
+"""Reasons for which no other guess can help."""
+
 
 @dataclass
 class _Trial:
@@ -57,7 +60,7 @@ class PhotoPolicy:
 
     def first_step(self, frame: FrameInfo) -> Step | None:
         """PRIOR, or a Look where there is no guess; None for a frame whose prior is awaited."""
-        prior = self._priors.of(frame.frame_id)
+        prior = self._priors.take(frame.frame_id)
         if prior is None and self._priors.awaited:
             return None
         trial = self._trials[frame.frame_id] = _Trial()
@@ -71,7 +74,7 @@ class PhotoPolicy:
         """RELOCALISATION; None where nothing looks like the frame and there was no guess to begin with."""
         trial = self._trials[attempt.frame.frame_id]
         trial.alike = alike.poses
-        if not trial.tried and alike.reason is Reason.NOTHING_ALIKE:
+        if alike.reason in _HOPELESS or (not trial.tried and alike.reason is Reason.NOTHING_ALIKE):
             return None
         return self._untried(trial)
 
@@ -84,6 +87,8 @@ class PhotoPolicy:
             settled = self._settled.holds(attempt.guess.cam_from_object, pose)
             if attempt.passes < self._config.passes and not settled:
                 return PoseGuess(GuessReason.NEXT_PASS, pose)
+        if result.reason in _HOPELESS:
+            return None
         if self._config.passes == 1 or trial.found is not None or len(trial.tried) > self._config.searches:
             return None
         return Look() if self._looks and trial.alike is None else self._untried(trial)
@@ -95,8 +100,10 @@ class PhotoPolicy:
         return self._belief(attempt, result) or trial.found or Belief(TrackingState.LOST, 0.0, reason=reason)
 
     def missed(self, frame: FrameInfo, reason: Reason) -> Belief:
-        """Nothing is known of a frame that did not come back."""
-        self._trials.pop(frame.frame_id, None)
+        """Of a frame that did not come back, what was believed before."""
+        trial = self._trials.pop(frame.frame_id, None)
+        if trial is not None and trial.found is not None:
+            return trial.found
         return Belief(TrackingState.LOST, 0.0, reason=reason)
 
     def _quality(self, result: PoseResult) -> float:

@@ -117,7 +117,7 @@ class Relocaliser:
             self._tried.add(untried[0].tobytes())
             self._likely_turn = False
             return untried[0]
-        if not untried:
+        if likely and not untried:
             self._tried.clear()
         self._likely_turn = True
         near_turn = bool(self._near) and (self._turn % 2 == 0 or not self._far)

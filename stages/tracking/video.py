@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from cachetools import FIFOCache
 
 from fieldpose.bus.messages import GuessReason, Reason, TrackingState
 from fieldpose.stages.geometry import Limit
@@ -19,6 +20,8 @@ from fieldpose.stages.tracking.search import Keyframes, Relocaliser
 from fieldpose.stages.tracking.trust import Trust
 
 _NEAR_POSES = 4
+_KEPT_ALIKE = 16
+"""Frames for which it is known which views look like them; more are never in flight."""
 
 
 class VideoPolicy:
@@ -45,7 +48,7 @@ class VideoPolicy:
         patience = self._relocaliser.lap if start is None else config.lost_after
         self._trust = Trust(config.lost_after, config.weak_after, patience)
         self._guesses = 0
-        self._alike: tuple[int, Sequence[np.ndarray]] = (-1, ())
+        self._alike: FIFOCache[int, Sequence[np.ndarray]] = FIFOCache(_KEPT_ALIKE)
         self._unconfirmed: tuple[int, np.ndarray] | None = None
 
     def on_prior(self, frame_id: int, cam_from_object: np.ndarray) -> None:
@@ -55,11 +58,9 @@ class VideoPolicy:
     def first_step(self, frame: FrameInfo) -> Step | None:
         """PRIOR where one has come; MOTION or KEYFRAME while there is a track, else where to begin, or a Look."""
         self._guesses += 1
-        prior = self._priors.of(frame.frame_id)
+        prior = self._priors.take(frame.frame_id)
         if prior is not None:
             return self._guess(GuessReason.PRIOR, prior)
-        if self._priors.awaited:
-            return None
         if not self._trust.tracked:
             return self._step_without_track()
         predicted, last = self._motion.predict(frame.capture_ns), self._motion.newest
@@ -71,7 +72,7 @@ class VideoPolicy:
 
     def after_look(self, attempt: Attempt, alike: Alike) -> PoseGuess | None:
         """RELOCALISATION: a training view that looks like the frame, or another pose to try."""
-        self._alike = (attempt.frame.frame_id, alike.poses)
+        self._alike[attempt.frame.frame_id] = alike.poses
         return self._guess(GuessReason.RELOCALISATION, self._relocaliser.next(alike.poses))
 
     def next_step(self, attempt: Attempt, result: PoseResult) -> Step | None:
@@ -120,8 +121,7 @@ class VideoPolicy:
         if attempt.retries == 0 and self._trust.tracked:
             nearest = self._keyframes.nearest(guess.cam_from_object, otherwise=self._motion.newest)
             return PoseGuess(GuessReason.KEYFRAME, nearest, guess.epoch)
-        looked_at, alike = self._alike
-        other = self._relocaliser.next(alike if looked_at == attempt.frame.frame_id else ())
+        other = self._relocaliser.next(self._alike.get(attempt.frame.frame_id, ()))
         return PoseGuess(GuessReason.RELOCALISATION, other, guess.epoch)
 
     def _quality(self, result: PoseResult) -> float:

@@ -13,7 +13,7 @@ from fieldpose.stages.geometry import is_rigid
 from fieldpose.stages.tracking import core
 from fieldpose.stages.tracking.policy import Alike, FrameInfo, PoseResult
 
-_RIGID_TOLERANCE = 1e-3
+RIGID_TOLERANCE = 1e-3
 
 
 def frame_info(message: CameraInfo) -> FrameInfo:
@@ -25,7 +25,7 @@ def frame_info(message: CameraInfo) -> FrameInfo:
 def pose_result(pose: Pose) -> PoseResult:
     """What the Tracker needs of a Pose message; a pose that is no rigid transform is a failure."""
     header, matrix = pose.header, copied(pose.cam_from_object)
-    if not is_rigid(matrix, _RIGID_TOLERANCE):
+    if not is_rigid(matrix, RIGID_TOLERANCE):
         return PoseResult(header.frame_id, header.pass_index, reason=Reason.IMPLAUSIBLE_POSE)
     return PoseResult(
         header.frame_id, header.pass_index, matrix, copied(pose.covariance), pose.inliers, pose.correspondences,

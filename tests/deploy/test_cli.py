@@ -6,6 +6,7 @@ import json
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -190,3 +191,9 @@ def test_doctor_finds_what_is_missing_and_writes_its_findings(
     assert findings["dataset"]["status"] == "failed"
     assert "no such folder" in findings["dataset"]["detail"]
     assert "ms" in capsys.readouterr().out
+
+
+def test_a_folder_for_logs_that_cannot_be_made_is_told(field: Path, tmp_path: Path, capsys: Any) -> None:
+    (tmp_path / "taken").write_text("a file")
+    assert main(["run", str(field), "--source", "camera:0", "--logs", str(tmp_path / "taken")]) == 2
+    assert "no folder for logs" in capsys.readouterr().err

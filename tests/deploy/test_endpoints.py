@@ -31,3 +31,7 @@ def test_a_port_is_free_until_someone_listens() -> None:
             check_free(f"tcp/127.0.0.1:{port}")
     with pytest.raises(TransportError, match=r"cannot listen on .*99999"):
         check_free("tcp/127.0.0.1:99999")
+
+
+def test_a_free_port_of_the_sixth_version_is_no_error() -> None:
+    check_free(f"tcp/[::1]:{free_port()}")

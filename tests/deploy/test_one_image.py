@@ -206,3 +206,11 @@ def test_a_finder_with_nothing_to_begin_with_says_so(scene: AnalyticScene) -> No
     finder, image = photo_finder(SETTINGS, NO_VIEWS, scene), scene.render_view(camera(120), viewpoint()).rgb
     assert finder.find(image, camera(120)).reason is Reason.NO_GUESS
     assert finder.find(image, camera(120), viewpoint(2.0)).ok
+
+
+def test_guesses_for_frames_are_none_for_an_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    field, guesses = demo_file("field.safetensors"), tmp_path / "guesses.json"
+    guesses.write_text(json.dumps({"frames": {"5": np.eye(4).tolist()}}))
+    image = field.parent / "images" / "test" / "001.jpg"
+    assert main(["estimate", str(field), str(image), "--guess", str(guesses)]) == 2
+    assert "a file with one pose" in capsys.readouterr().err

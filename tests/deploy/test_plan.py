@@ -55,7 +55,7 @@ def test_what_is_said_is_not_decided_anew() -> None:
     assert (chosen.refinement.when, chosen.matching.device, chosen.backend) == ("never", "meta", "torch")
 
 
-@pytest.mark.parametrize("source", ["", "folder:a", "mcap:a.mcap"])
+@pytest.mark.parametrize("source", ["", "dataset:a:test", "mcap:a.mcap"])
 def test_a_plan_read_back_is_the_same_plan(source: str, tmp_path: Any) -> None:
     """As the processes get it, and a recording keeps it."""
     first = resolve(from_source(source, tracking={"guess": "perturb:10-40deg,0.2"}), KNOWN)
@@ -100,3 +100,32 @@ def test_what_cannot_be_is_refused_before_anything_starts() -> None:
         resolve(from_source("tape:3"), KNOWN)
     with pytest.raises(ConfigError, match="nowhere"):
         resolve(settings(tracking={"guess": "nowhere.json"}), KNOWN)
+
+
+def test_guesses_made_from_the_truth_need_a_source_that_knows_it() -> None:
+    for source in ("folder:a", "video:a.mp4", "camera:0"):
+        with pytest.raises(ConfigError, match="does not know"):
+            resolve(from_source(source, tracking={"guess": "perturb:10-40deg,0.2"}), KNOWN)
+    assert resolve(from_source("dataset:a:test", tracking={"guess": "perturb:10-40deg,0.2"}), KNOWN).begins.by_frame
+
+
+def test_a_file_of_guesses_is_found_from_any_folder(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "guess.json").write_text('{"cam_from_object": [[1,0,0,0],[0,1,0,0],[0,0,1,4],[0,0,0,1]]}')
+    monkeypatch.chdir(tmp_path)
+    plan = resolve(from_source("folder:a", tracking={"guess": "guess.json"}), KNOWN)
+    assert plan.settings.tracking.guess == str(tmp_path / "guess.json")
+
+
+def test_infinity_survives_the_way_to_the_processes(tmp_path: Any) -> None:
+    plan = resolve(settings(tracking={"motion": {"damping_ms": float("inf")}}), KNOWN)
+    path = tmp_path / "settings.json"
+    path.write_bytes(to_json(plan.settings))
+    assert read_settings(str(path)).tracking.motion.damping_ms == float("inf")
+
+
+@pytest.mark.parametrize(
+    ("stage", "setting"), [("rendering", {"size": -5}), ("lifting", {"views": -1}), ("refinement", {"samples": 0})]
+)
+def test_numbers_that_mean_nothing_are_refused_by_name(stage: str, setting: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match=f"{stage}: {next(iter(setting))} is "):
+        settings(**{stage: setting})

@@ -18,19 +18,21 @@ from fieldpose.stages.geometry import Camera
 
 
 class Kind(NamedTuple):
-    """How to open a source, given what stands after the colon; is_video: its frames follow one another in time."""
+    """How to open a source, given what stands after the colon; is_video: its frames follow one another in time;
+    knows_truth: it may know its frames' true poses."""
 
     open: Callable[[str, CameraConfig, Calibrator], Source]
     example: str
     is_video: bool
+    knows_truth: bool = False
 
 
 KINDS: dict[str, Kind] = {
     "folder": Kind(open_folder, "folder:DIR", False),
-    "dataset": Kind(open_dataset, "dataset:DIR:test", False),
+    "dataset": Kind(open_dataset, "dataset:DIR:test", False, True),
     "video": Kind(open_video, "video:FILE", True),
     "camera": Kind(open_device, "camera:0", True),
-    "mcap": Kind(open_recording, "mcap:FILE", True),
+    "mcap": Kind(open_recording, "mcap:FILE", True, True),
 }
 
 
@@ -47,6 +49,11 @@ def open_source(config: CameraConfig, known: Sequence[Camera] = ()) -> Source:
 def is_video(source: str) -> bool:
     """Whether motion between the frames of such a source may be relied upon. Raises SourceError."""
     return source == EXTERNAL or _parse(source)[0].is_video
+
+
+def knows_truth(source: str) -> bool:
+    """Whether the true poses of such a source's frames may be known. Raises SourceError."""
+    return source == EXTERNAL or _parse(source)[0].knows_truth
 
 
 def _parse(source: str) -> tuple[Kind, str]:

@@ -112,3 +112,9 @@ def _resize_nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
     if values.shape == (height, width):
         return values
     return cv2.resize(values, (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+
+
+def load_photo(path: Path) -> np.ndarray:
+    """The pixels (h, w, 3) uint8 RGB of an image file, transparent parts laid over white. Raises DatasetError."""
+    header = probe(path)
+    return over_background(load_pixels(path, header.width, header.height, header.has_alpha), "white")

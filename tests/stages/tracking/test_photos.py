@@ -338,3 +338,22 @@ def test_a_single_pass_has_nothing_to_confirm_it_and_is_not_searched_for(looks: 
     unusable = Photo(policy)
     unusable.gives(pose, inliers=5)
     assert replace(unusable.belief(), reason=None) == Belief(TrackingState.LOST, 0.0)
+
+
+@pytest.mark.parametrize("reason", [Reason.FRAME_UNREADABLE, Reason.FRAME_MISSING])
+def test_no_other_guess_is_tried_for_a_photo_that_cannot_be_seen(reason: Reason) -> None:
+    policy = photos(looks=True)
+    step = policy.first_step(FRAME)
+    assert isinstance(step, PoseGuess)
+    attempt = Attempt(FRAME, 0).again(step, 0)
+    result = PoseResult(FRAME.frame_id, 0, reason=reason)
+    assert policy.next_step(attempt, result) is None
+    assert policy.conclude(attempt, result).reason is reason
+
+
+def test_what_was_believed_stays_where_the_pass_that_was_to_confirm_it_is_lost() -> None:
+    photo = Photo(policy := photos())
+    photo.gives(pose := on_sphere(20, 30))
+    belief = policy.missed(FRAME, Reason.NO_ANSWER)
+    assert belief.state is TrackingState.TRACKING
+    assert belief.cam_from_object is pose

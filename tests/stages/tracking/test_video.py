@@ -125,16 +125,6 @@ def test_a_prior_is_the_guess_of_its_frame_alone() -> None:
     assert camera.guess().reason is GuessReason.MOTION
 
 
-def test_a_frame_whose_prior_is_awaited_has_no_step_without_it() -> None:
-    camera = Camera(awaited=True)
-    frame = camera.frame()
-    assert camera.policy.first_step(frame) is None
-    camera.policy.on_prior(frame.frame_id, prior := on_sphere(70, 20))
-    step = camera.policy.first_step(frame)
-    assert isinstance(step, PoseGuess)
-    assert (step.reason, step.cam_from_object is prior) == (GuessReason.PRIOR, True)
-
-
 def test_a_jump_waits_for_a_second_frame_and_then_begins_a_new_motion() -> None:
     camera = tracking(jump_per_s=Limit(10, 1))
     first = camera.see(on_sphere(60, 30))

@@ -317,6 +317,7 @@ class Stats(Message, kw_only=True):
     """Counters of one process since it started; sent from its main loop, so that it is the heartbeat as well.
 
     `gaps` are messages that should have come and did not; `skipped` those that a newest-only input let go.
+    `busy_s` is what all calls that answered took, `busy_ms_` what the newest of them did.
     """
 
     stage: str
@@ -331,3 +332,4 @@ class Stats(Message, kw_only=True):
     busy_ms_p90: float
     cpu_s: float
     rss_mb: float
+    busy_s: float = 0.0

@@ -165,6 +165,7 @@ class _Node:
         self._throttle = Throttle(stage_logger(handler.name))
         self._failed = 0
         self._busy_ms: deque[float] = deque(maxlen=_BUSY_WINDOW)
+        self._busy_s = 0.0
         self._process = psutil.Process()
         self._next_tick = self._next_stats = 0.0
 
@@ -226,6 +227,7 @@ class _Node:
             self._throttle.warning("failed", error=describe(error))
         if self._outbox.published > before:
             self._busy_ms.append((time.perf_counter() - started) * 1e3)
+            self._busy_s += self._busy_ms[-1] / 1e3
 
     def _publish(self, topic: Topic[Any], message: Message) -> None:
         """Send a message, or where that cannot be sent a Failure in its place; what else there is to send goes on."""
@@ -264,4 +266,5 @@ class _Node:
             busy_ms_p90=float(p90),
             cpu_s=times.user + times.system,
             rss_mb=self._process.memory_info().rss / 2**20,
+            busy_s=self._busy_s,
         )

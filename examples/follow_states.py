@@ -12,6 +12,7 @@ import fieldpose
 
 def main(hub: str = "tcp/127.0.0.1:7447", patience_s: str = "30") -> int:
     with fieldpose.connect(hub) as pipeline:
+        print(f"following the pipeline at {hub}", flush=True)
         for state in pipeline.states(timeout_s=float(patience_s)):
             if state.cam_from_object is None:
                 print(f"frame {state.header.frame_id}: {state.state}, no pose: {state.reason}", flush=True)

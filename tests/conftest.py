@@ -4,6 +4,7 @@ In tests, calls of the modules below check the shapes and dtypes of the arrays t
 geometry's rigid, errors and limits, whose small functions are called so often that tests would take a fifth longer.
 """
 
+import os
 import sys
 from pathlib import Path
 
@@ -33,3 +34,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 install_import_hook(CHECKED, 'importlib.import_module("support.shapes").checked')
 settings.register_profile("same_each_time", derandomize=True)
 settings.load_profile("same_each_time")
+
+# Before torch is imported: on pictures so small, threads wait for each other longer than they work, and beside other
+# work many times as long. Processes that fieldpose starts have budgets of their own.
+for name, value in {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}.items():
+    os.environ.setdefault(name, value)

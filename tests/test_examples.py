@@ -29,6 +29,16 @@ def run_example(name: str, *arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+def read_until(process: subprocess.Popen[str], beginning: str) -> str:
+    """What a process has said, up to a line that begins so or to its end."""
+    said = ""
+    for line in process.stdout or ():
+        said += line
+        if line.startswith(beginning):
+            break
+    return said
+
+
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.name)
 def test_an_example_is_short(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= MOST_LINES
@@ -79,13 +89,17 @@ def test_frames_from_ones_own_code_are_answered_with_states(tmp_path: Path) -> N
         for line in pipeline.stderr:
             if line.endswith("running\n"):
                 break
-        follower = run_example("follow_states.py", hub, 8)
-        publisher = run_example("publish_frames.py", tmp_path / "%03d.png", camera, hub)
-        sent, complaint = publisher.communicate(timeout=60)
-        assert f"sent frame {FRAMES - 1}" in sent, complaint
-        followed, complaint = follower.communicate(timeout=60)
-        assert "score" in followed, complaint
+        with run_example("follow_states.py", hub) as follower:
+            assert read_until(follower, "following")
+            publisher = run_example("publish_frames.py", tmp_path / "%03d.png", camera, hub)
+            sent, complaint = publisher.communicate(timeout=60)
+            assert f"sent frame {FRAMES - 1}" in sent, complaint
+            followed = read_until(follower, f"frame {FRAMES - 1}: ")
+            follower.kill()
+        assert "score" in followed
         assert "camera at" in followed
+        with fieldpose.connect(hub) as connection:
+            assert list(connection.states(timeout_s=0.2)) == []
     finally:
         pipeline.send_signal(signal.SIGINT)
         said, complaint = pipeline.communicate(timeout=30)

@@ -8,12 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from fieldpose.bus.messages import Frame, State
 from fieldpose.deploy.benchmarks import machine
 from fieldpose.deploy.commands.run import planned
-from fieldpose.deploy.graph import BY_NAME, threads_of
+from fieldpose.deploy.graph import AT_WORK, BY_NAME, threads_of
 from fieldpose.deploy.local import LocalPipeline
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan
@@ -65,17 +63,13 @@ def plan_of(mode: str, frames: int | None) -> Plan:
 
 
 def bus_share(run: RunResult) -> float | None:
-    """Of a frame's time from the camera's sending to its state, the share in which no process was at work for it.
+    """Of the time of all frames from the camera's sending to their states, the share in which no process was at work.
 
-    That is transport, decoding and waiting. What a process works on a frame is its usual call as often as it has said
-    something of it. The median over the frames; None without any.
+    That is transport, decoding and waiting, for a place in a queue or for a core. None without any frame.
     """
-    shares = []
-    for frame in run.frames:
-        if frame.latency_ms:
-            busy = sum(run.stats[name].busy_ms_p50 * n for name, n in frame.answers.items() if name in run.stats)
-            shares.append(max(0.0, 1.0 - busy / frame.latency_ms))
-    return float(np.median(shares)) if shares else None
+    latency_s = sum(frame.latency_ms or 0.0 for frame in run.frames) / 1e3
+    busy_s = sum(stats.busy_s for name, stats in run.stats.items() if name in AT_WORK)
+    return max(0.0, 1.0 - busy_s / latency_s) if latency_s > 0 else None
 
 
 def _in_processes(plan: Plan, report: Callable[[str], None]) -> dict[str, Any]:

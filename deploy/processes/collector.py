@@ -140,7 +140,6 @@ def _result(frame_id: int, seen: _Seen) -> FrameResult:
         sent_ns=seen.camera_sent_ns,
         answered_ns=None if state is None else state.header.sent_ns,
         stage_ms=dict(_stage_ms(seen)),
-        answers=Counter(source for _, source in _sent(seen)),
     )
 
 
@@ -152,18 +151,16 @@ def _outcome(seen: _Seen) -> Outcome:
 
 def _stage_ms(seen: _Seen) -> Iterator[tuple[str, float]]:
     """How long each process took for the frame, all passes together: from what was sent before to its own sending."""
+    sent = list(seen.sent)
+    if seen.state is not None:
+        sent.append((seen.state.header.sent_ns, seen.state.header.source))
     total: dict[str, float] = {}
     before = seen.camera_sent_ns
-    for now, source in sorted(_sent(seen)):
+    for now, source in sorted(sent):
         if before is not None:
             total[source] = total.get(source, 0.0) + (now - before) / 1e6
         before = now
     yield from total.items()
-
-
-def _sent(seen: _Seen) -> list[tuple[int, str]]:
-    """When each process has said something of the frame, the state among it."""
-    return seen.sent if seen.state is None else [*seen.sent, (seen.state.header.sent_ns, seen.state.header.source)]
 
 
 def _copied(array: np.ndarray | None) -> np.ndarray | None:

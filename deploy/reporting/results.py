@@ -23,7 +23,7 @@ The keys of a summary, which programs may rely on:
                      a recorder: those that a stage should have got)
   restarts           name of a process -> how often it came back
   start_s            seconds until all processes were ready
-  processes          name -> busy_ms_p50, busy_ms_p90, cpu_s, rss_mb, failed, refused, gaps, skipped
+  processes          name -> busy_ms_p50, busy_ms_p90, busy_s, cpu_s, rss_mb, failed, refused, gaps, skipped
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ Outcome = Literal["finished", "lost", "dropped"]
 CLOSE_DEG, CLOSE = 5.0, 0.05
 """The limits of the paper's table I, in degrees and in units of the field."""
 
-_STATS = ("busy_ms_p50", "busy_ms_p90", "cpu_s", "rss_mb", "failed", "refused", "gaps", "skipped")
+_STATS = ("busy_ms_p50", "busy_ms_p90", "busy_s", "cpu_s", "rss_mb", "failed", "refused", "gaps", "skipped")
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,7 @@ class TruthKnown:
 class FrameResult:
     """What became of a frame; `cam_from_object` is the pose measured, None where none was.
 
-    covariance: (6, 6) of the pose's left twist, where it is known. stage_ms, answers: how long each process took for
-    the frame, and how often it has said something of it, all passes together.
+    covariance: (6, 6) of the pose's left twist, where it is known.
     """
 
     frame_id: int
@@ -80,7 +79,6 @@ class FrameResult:
     sent_ns: int | None = None
     answered_ns: int | None = None
     stage_ms: Mapping[str, float] = field(default_factory=dict)
-    answers: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def true_pose(self) -> np.ndarray | None:

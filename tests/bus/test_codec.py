@@ -29,6 +29,7 @@ LATER = {
     topics.FRAME: {"camera_origin"},
     topics.CAMERA_INFO: {"camera_origin"},
     topics.STATE: {"reason", "camera_origin"},
+    topics.STATS: {"busy_s"},
 }
 FREE_TEXT = ("view_id", "stage")
 every_topic = pytest.mark.parametrize("topic", topics.ALL, ids=lambda topic: topic.name)
@@ -438,6 +439,10 @@ class TestCameras:
 
 class TestOlderMessages:
     """What was recorded before a field came to its message can still be read."""
+
+    def test_stats_without_the_time_at_work(self) -> None:
+        older = {key: value for key, value in wire(topics.STATS).items() if key != "busy_s"}
+        assert decode(msgpack.packb(older), messages.Stats).busy_s == 0.0
 
     def test_a_state_without_a_reason_and_an_origin_of_the_camera(self) -> None:
         older = {key: value for key, value in wire(topics.STATE).items() if key not in ("reason", "camera_origin")}

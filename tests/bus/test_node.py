@@ -498,6 +498,7 @@ class TestStats:
             time.sleep(0.2)
         last = stats(numbers)[-1]
         assert 20 <= last.busy_ms_p50 <= last.busy_ms_p90 < 1000
+        assert last.busy_s >= last.busy_ms_p50 / 1e3
 
 
 STAGE = """

@@ -26,7 +26,7 @@ from fieldpose.deploy.graph import RECORDER, STAGES
 from fieldpose.deploy.reporting.results import FrameResult, RunResult, summarise
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import Settings, changed
-from fieldpose.stages.geometry import points_at_depth
+from fieldpose.stages.geometry import Limit, points_at_depth
 from fieldpose.stages.matching.core import MatchedPixels
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.from_dataset import train_field
@@ -180,25 +180,24 @@ def test_the_other_process_ends_with_the_one_that_started_it() -> None:
 
 
 def test_a_frames_time_is_its_processes_work_and_the_rest() -> None:
-    stats = {
-        name: replace(bus_samples.every_message()[STATS], stage=name, busy_ms_p50=ms)
-        for name, ms in (("tracking", 5.0), ("pnp", 10.0))
-    }
-    frames = [
-        FrameResult(0, 0, "finished", sent_ns=0, answered_ns=100 * 10**6, answers={"tracking": 3, "pnp": 2, "gone": 1}),
-        FrameResult(1, 0, "finished", sent_ns=0, answered_ns=40 * 10**6, answers={"tracking": 2, "pnp": 1}),
-        FrameResult(2, 0, "finished", sent_ns=0, answered_ns=50 * 10**6, answers={"tracking": 2, "pnp": 1}),
-        FrameResult(3, 0, "lost", sent_ns=0, answers={"tracking": 1}),
-    ]
-    assert track.bus_share(RunResult(frames, stats=stats)) == pytest.approx(0.6)  # of 0.65, 0.5 and 0.6
-    assert track.bus_share(RunResult(frames[3:], stats=stats)) is None
+    sample = bus_samples.every_message()[STATS]
+    work = {"tracking": 0.01, "pnp": 0.03, "recorder": 9.0}
+    stats = {name: replace(sample, stage=name, busy_s=busy_s) for name, busy_s in work.items()}
+    frames = [FrameResult(i, 0, "finished", sent_ns=0, answered_ns=ms * 10**6) for i, ms in enumerate((60, 40))]
+    lost = FrameResult(2, 0, "lost", sent_ns=0)
+    assert track.bus_share(RunResult([*frames, lost], stats=stats)) == pytest.approx(0.6)
+    assert track.bus_share(RunResult([lost], stats=stats)) is None
     assert track.figures_of(RunResult([]))["share_of_frames"] is None
 
 
-def test_the_default_mode_of_tracking_is_the_demo() -> None:
+def test_the_default_mode_of_tracking_is_the_demo_and_the_other_leaves_nothing_out() -> None:
     demo = planned(changed(Settings(), {"camera": {"source": f"mcap:{demo_file('sequence.mcap')}"}}, "test"), FIELD)
     assert track.plan_of("default", None) == demo
     assert demo.settings.camera.pace == "live"
+    full = track.plan_of("full", 5).settings
+    assert (full.rendering.size, full.refinement.when, full.camera.frames) == (400, "always", 5)
+    assert full.tracking.passes == demo.settings.tracking.passes > 1
+    assert full.tracking.settled == full.tracking.far == Limit(0.0, 0.0)
 
 
 @pytest.mark.slow
@@ -211,7 +210,7 @@ def test_tracking_is_measured_in_processes_and_in_one(tmp_path: Path, capsys: py
     assert summarise(RunResult([])).keys() <= full.keys()
     assert full["frames_sent"] == 2
     assert full["frames"] >= 1
-    assert full["passes"] >= 3
+    assert full["passes"] > 1
     assert full["plan"]["sequence"].startswith("video")
     assert full["share_of_frames"] == full["poses_ok"] / 2
     assert 0 <= full["bus_share"] <= 1

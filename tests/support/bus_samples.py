@@ -160,6 +160,7 @@ def every_message() -> dict[Topic[Any], Message]:
             failed=0,
             busy_ms_p50=1.5,
             busy_ms_p90=2.5,
+            busy_s=0.5,
             cpu_s=3.0,
             rss_mb=80.0,
         ),

@@ -40,7 +40,7 @@ from fieldpose.bus.topics import (
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan
 from fieldpose.errors import UsageError
-from fieldpose.stages.camera.sources import EXTERNAL
+from fieldpose.stages.camera.sources import EXTERNAL, knows_truth
 
 HUB, RECORDER, CAMERA = "hub", "recorder", "camera"
 OBSERVER = "observer"
@@ -102,7 +102,10 @@ def _recorder(parts: Parts, launch: Launch) -> Handler:
 def _camera(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.camera.node import CameraNode
 
-    return CameraNode(parts.settings.camera, parts.known_cameras, launch.wait_until_ready)
+    config = parts.settings.camera
+    # A source that knows its frames' poses knows their cameras too.
+    known = tuple if config.source and knows_truth(config.source) else parts.known_cameras
+    return CameraNode(config, known, launch.wait_until_ready)
 
 
 def _perturbation(parts: Parts, launch: Launch) -> Handler:

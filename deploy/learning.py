@@ -13,9 +13,9 @@ from fieldpose.errors import WeightsError
 from fieldpose.stages.matching.core import MatchingConfig
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.datasets.assemble import Holdout
-from fieldpose.stages.nerf.field import DESCRIBED_SIZE, Field
+from fieldpose.stages.nerf.field import Field
 from fieldpose.stages.nerf.from_dataset import TrainedField, TrainingReport, train_field
-from fieldpose.stages.nerf.metadata import PoseAccuracy
+from fieldpose.stages.nerf.metadata import DESCRIBED_SIZE, PoseAccuracy
 
 Say = Callable[[str], None]
 

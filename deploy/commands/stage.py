@@ -6,7 +6,7 @@ import dataclasses
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -35,7 +35,7 @@ from fieldpose.deploy.processes.warmup import compile_kernels
 from fieldpose.deploy.settings import Settings
 
 if TYPE_CHECKING:
-    from fieldpose.stages.nerf.training_views import TrainingViews
+    from fieldpose.stages.nerf.field import Field
 
 _START_S = 300.0
 """Others may be compiling their kernels."""
@@ -92,10 +92,13 @@ class Options:
 
 def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handler]) -> None:
     settings = options.settings
-    plan = resolve(settings, _views(options.field), options.field)
+    plan, field = _planned(settings, options.field if row.needs_field else None)
+    plan = replace(plan, field=options.field)
     threads = options.threads or threads_of(row, plan.in_flight)
     os.environ.update(thread_environment(threads))
     parts = Parts(plan, threads)
+    if field is not None:
+        parts.field = field
     if options.field is not None and row.renders and plan.settings.backend == "numba":
         compile_kernels(options.field, row.name)
     address = settings.address
@@ -120,13 +123,15 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
         bus.close()
 
 
-def _views(field: Path | None) -> TrainingViews | None:
-    if field is None:
-        return None
+def _planned(settings: Settings, path: Path | None) -> tuple[Plan, Field | None]:
+    """The plan of a process, and the field, which only a process that needs it reads: that takes half a second."""
+    if path is None:
+        return resolve(settings, None), None
     from fieldpose.stages.nerf.field import load_field
     from fieldpose.stages.nerf.training_views import training_views
 
-    return training_views(load_field(field))
+    field = load_field(path)
+    return resolve(settings, training_views(field), path), field
 
 
 def _tell(plan: Plan, row: Process) -> None:

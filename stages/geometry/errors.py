@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fieldpose.stages.geometry.arrays import Covariance, Points, Transform, Values
 from fieldpose.stages.geometry.rigid import camera_centre, inverse, log_se3
@@ -11,6 +10,9 @@ from fieldpose.stages.geometry.rigid import camera_centre, inverse, log_se3
 
 def rotation_error_deg(cam_from_object_a: Transform, cam_from_object_b: Transform) -> float:
     """The angle of the rotation between two poses, 0 to 180 degrees."""
+    # Processes that have no poses do without scipy, which takes 0.15 s to import.
+    from scipy.spatial.transform import Rotation
+
     between = Rotation.from_matrix(cam_from_object_a[:3, :3] @ cam_from_object_b[:3, :3].T)
     return float(np.rad2deg(between.magnitude()))
 

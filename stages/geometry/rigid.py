@@ -8,12 +8,16 @@ for an inverse.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from fieldpose.errors import GeometryError
 from fieldpose.stages.geometry.arrays import Matrix3, Matrix6, Points, Transform, Transforms, Twist, Vector
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 _SMALL_ANGLE = 1e-4
 
@@ -27,13 +31,15 @@ def skew(vector: ArrayLike) -> Matrix3:
 def from_rotation(rotation: Rotation | ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Transform:
     """Put a rotation (scipy Rotation or (3, 3)) and a translation (3,) together."""
     transform = np.eye(4)
-    transform[:3, :3] = rotation.as_matrix() if isinstance(rotation, Rotation) else rotation
+    transform[:3, :3] = rotation.as_matrix() if hasattr(rotation, "as_matrix") else rotation
     transform[:3, 3] = translation
     return transform
 
 
 def exp_se3(twist: ArrayLike) -> Transform:
     """The rigid transform of a twist (6,); Lynch and Park, Modern Robotics, eq. 3.88."""
+    from scipy.spatial.transform import Rotation
+
     translation, rotation = np.split(np.asarray(twist, dtype=np.float64), 2)
     angle = float(np.linalg.norm(rotation))
     cross = skew(rotation)
@@ -47,6 +53,8 @@ def exp_se3(twist: ArrayLike) -> Transform:
 
 def log_se3(transform: Transform) -> Twist:
     """The twist of a rigid transform, with a rotation of at most pi; Modern Robotics, eq. 3.91 and 3.92."""
+    from scipy.spatial.transform import Rotation
+
     rotation = Rotation.from_matrix(transform[:3, :3]).as_rotvec()
     angle = float(np.linalg.norm(rotation))
     cross = skew(rotation)
@@ -96,6 +104,8 @@ def nearest_rigid(transform: Transform) -> Transform:
 
 def rotation_about(axis: ArrayLike, angle_rad: float) -> Transform:
     """Rotation by angle_rad about an axis (3,) through the origin. GeometryError if the axis is zero."""
+    from scipy.spatial.transform import Rotation
+
     return from_rotation(Rotation.from_rotvec(angle_rad * _unit(axis, "the axis of a rotation")))
 
 

@@ -19,8 +19,6 @@ from fieldpose.stages.nerf.metadata import FORMAT_VERSION, FieldMetadata, Space
 from fieldpose.stages.nerf.occupancy import pack
 
 DESCRIPTOR_SIZE = 64
-DESCRIBED_SIZE = 400
-"""Longer side to which larger images are shrunk before they are described."""
 LEARNT = ("table", "w1", "w2", "c1", "c2", "c3")
 
 

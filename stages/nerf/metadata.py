@@ -9,6 +9,8 @@ from fieldpose.stages.geometry import Camera
 from fieldpose.stages.nerf.config import FieldConfig
 
 FORMAT_VERSION = 1
+DESCRIBED_SIZE = 400
+"""Longer side to which larger images are shrunk before they are described."""
 
 
 class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

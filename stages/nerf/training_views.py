@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry import camera_centres
 from fieldpose.stages.nerf.datasets import find_name
-from fieldpose.stages.nerf.field import DESCRIBED_SIZE, Field
+from fieldpose.stages.nerf.metadata import DESCRIBED_SIZE
+
+if TYPE_CHECKING:
+    from fieldpose.stages.nerf.field import Field
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,7 @@ import msgspec
 from fieldpose.bus.topics import Address
 from fieldpose.errors import ConfigError
 from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.geometry import Limit
 from fieldpose.stages.lifting.config import LiftingConfig
 from fieldpose.stages.matching.core import MatchingConfig
 from fieldpose.stages.nerf.config import Backend
@@ -97,14 +98,20 @@ def changed(config: T, changes: dict[str, Any], origin: str, place: str = "") ->
 
 
 def without_unknown(config: Any, changes: dict[str, Any], place: str = "") -> list[str]:
-    """Take what `config` does not have out of the changes, nested tables too; returns the names."""
-    names = {item.name for item in dataclasses.fields(config)}
-    gone = [f"{place}{key}" for key in changes if key not in names]
-    for key in set(changes) - names:
-        del changes[key]
-    for key, value in changes.items():
-        if dataclasses.is_dataclass(getattr(config, key)) and isinstance(value, dict):
-            gone += without_unknown(getattr(config, key), value, f"{place}{key}.")
+    """Take what `config` does not have, or has as a table, out of the changes, nested ones too; returns the names.
+
+    A length `x` with its angle `x_deg` becomes the limit that `x` may be in their place.
+    """
+    for key in [key for key in changes if f"{key}_deg" in changes and isinstance(getattr(config, key, None), Limit)]:
+        changes[key] = {"angle_deg": changes.pop(f"{key}_deg"), "distance": changes[key]}
+    gone = []
+    for key, value in list(changes.items()):
+        own = getattr(config, key, None)
+        if not hasattr(config, key) or (dataclasses.is_dataclass(own) and not isinstance(value, dict)):
+            del changes[key]
+            gone.append(f"{place}{key}")
+        elif dataclasses.is_dataclass(own):
+            gone += without_unknown(own, value, f"{place}{key}.")
     return gone
 
 

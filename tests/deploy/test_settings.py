@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from fieldpose.deploy.settings import Settings, changed, read_file, read_settings, to_json, without_unknown
 from fieldpose.errors import ConfigError
+from fieldpose.stages.geometry import Limit
 
 
 def written(path: Path, text: str) -> Path:
@@ -79,6 +81,11 @@ def test_files_that_are_not_there_or_hold_no_table_are_told(tmp_path: Path) -> N
 
 
 def test_what_a_version_no_longer_has_is_left_out_and_named() -> None:
-    content = {"tracking": {"settled_deg": 2.0, "depth": 3, "motion": {"inertia": 1}}, "smoothing": {}}
-    assert without_unknown(Settings(), content) == ["smoothing", "tracking.settled_deg", "tracking.motion.inertia"]
-    assert changed(Settings(), content, "test").tracking.depth == 3
+    content: dict[str, Any] = {
+        "tracking": {"jump_per_s": 1.0, "depth": 3, "settled_deg": 2.0, "settled": 0.01, "motion": {"inertia": 1}},
+        "smoothing": {},
+    }
+    left_out = {"smoothing", "tracking.jump_per_s", "tracking.motion.inertia"}
+    assert set(without_unknown(Settings(), content)) == left_out
+    tracking = changed(Settings(), content, "test").tracking
+    assert (tracking.depth, tracking.settled) == (3, Limit(2.0, 0.01))

@@ -37,7 +37,7 @@ class Joined:
     @property
     def frame_key(self) -> tuple[int, int]:
         """Tells the frame from all others of its camera."""
-        return self.header.frame_id, self.header.capture_ns
+        return self.header.frame_key
 
 
 @dataclass

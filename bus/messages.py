@@ -63,6 +63,9 @@ class CameraOrigin(StrEnum):
     ASSUMED = "assumed"
 
 
+Encoding = Literal["rgb8", "jpeg", "png"]
+
+
 class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """`sequence` counts from 0 per (source, topic), so that a receiver sees what it missed."""
 
@@ -79,6 +82,11 @@ class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError("header: numbers must be from 0 to 2^63 - 1")
         if len(self.source) > 128:
             raise ValueError("header: source is longer than 128 characters")
+
+    @property
+    def frame_key(self) -> tuple[int, int]:
+        """Tells the frame from all others of its camera."""
+        return self.frame_id, self.capture_ns
 
 
 class Message(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
@@ -125,7 +133,7 @@ class Frame(Message, kw_only=True):
     """A camera image: `rgb8` is (height, width, 3), `jpeg` and `png` are the (n,) bytes of the file."""
 
     image: np.ndarray
-    encoding: Literal["rgb8", "jpeg", "png"]
+    encoding: Encoding
     camera: Camera
     camera_origin: CameraOrigin = CameraOrigin.CALIBRATED
 

@@ -13,9 +13,7 @@ import msgspec
 import numpy as np
 
 from fieldpose.bus.messages import (
-    CameraInfo,
     CameraOrigin,
-    Frame,
     Guess,
     Message,
     Pose,
@@ -25,12 +23,13 @@ from fieldpose.bus.messages import (
     TrackingState,
 )  # fmt: skip
 from fieldpose.bus.node import EndOfInput, Handler, Output, first_header
-from fieldpose.bus.topics import CAMERA_INFO, FRAME, PRIOR, Topic
+from fieldpose.bus.topics import PRIOR, Topic
 from fieldpose.deploy.graph import CAMERA, HUB, RECORDER, Launch, rows_of
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import resolve
 from fieldpose.deploy.settings import Settings
 from fieldpose.errors import ConfigError
+from fieldpose.stages.camera.wire import frame_messages
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 from fieldpose.stages.nerf.training_views import TrainingViews
@@ -131,6 +130,7 @@ class PoseFinder:
         """
         from fieldpose.stages.lifting.core import lift
         from fieldpose.stages.lifting.node import view_rng
+        from fieldpose.stages.rendering.core import opacity_bytes
 
         parts = self._parts
         for pose in parts.training_views.cam_from_object:
@@ -138,7 +138,7 @@ class PoseFinder:
             if isinstance(sourced, Reason):
                 continue
             view, view_id = sourced.view, sourced.view_id
-            opacity = np.rint(view.opacity * 255).astype(np.uint8)
+            opacity = opacity_bytes(view.opacity)
             pixels = parts.pairs.view_features(view.rgb, opacity, view_id).pixels
             lift(
                 parts.renderer, view.depth, opacity, view.camera, pose, pixels, view_rng(view_id),
@@ -159,8 +159,7 @@ class PoseFinder:
         sent: list[Output] = []
         if guess is not None:
             sent.append((PRIOR, Prior(header=header, cam_from_object=np.array(guess, np.float64))))
-        frame = Frame(header=header, image=image, encoding="rgb8", camera=camera, camera_origin=origin)
-        sent += [(FRAME, frame), (CAMERA_INFO, CameraInfo(header=header, camera=camera, camera_origin=origin))]
+        sent += frame_messages(header, image, "rgb8", camera, origin)
         return _found(list(self._pipeline.send(*sent)))
 
     def close(self) -> None:

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from fieldpose.stages.nerf.rendering_api import RayRenderer
     from fieldpose.stages.nerf.training_views import TrainingViews
     from fieldpose.stages.rendering.core import ViewSource
+    from fieldpose.stages.retrieval.node import DescribeFrame
     from fieldpose.stages.tracking.core import Tracker
-
-DescribeFrame = Callable[[np.ndarray, Frame], np.ndarray]
 
 _KEPT_VIEWS = 128
 
@@ -101,20 +100,18 @@ class Parts:
 
         self._limit_torch()
         size, matching = self.training_views.size, self.settings.matching
-        own: list[Callable[[np.ndarray], np.ndarray]] = []
-        if not self._together or matching.matcher != "xfeat":
-            own.append(self._describer(size))
+        shared = self._together and matching.matcher == "xfeat"
+        if not shared:
+            _ = self._describer
 
         def describe(image: np.ndarray, frame: Frame) -> np.ndarray:
             small = view_camera(frame.camera, self.settings.rendering.longer_side)
             matched, given = matching.frame_size or max(small.width, small.height), max(image.shape[:2])
-            if self._together and matching.matcher == "xfeat" and min(matched, given) == min(size, given):
-                key = (frame.header.frame_id, frame.header.capture_ns)
-                descriptors: np.ndarray = self.pairs.frame_features(image, matched, key).data.cpu().numpy()
+            if shared and min(matched, given) == min(size, given):
+                features = self.pairs.frame_features(image, matched, frame.header.frame_key)
+                descriptors: np.ndarray = features.data.cpu().numpy()
                 return descriptors
-            if not own:
-                own.append(self._describer(size))
-            return own[0](image)
+            return self._describer(image)
 
         return describe
 
@@ -126,9 +123,11 @@ class Parts:
         config = self.settings.tracking
         return Tracker(config, make_policy(config, self.training_views, self.plan.looks))
 
-    def _describer(self, size: int) -> Callable[[np.ndarray], np.ndarray]:
+    @cached_property
+    def _describer(self) -> Callable[[np.ndarray], np.ndarray]:
         from fieldpose.stages.retrieval.core import describer
 
+        size = self.training_views.size
         describe = describer(self.settings.matching, size, self.settings.retrieval.keypoints)
         describe(np.zeros((64, 64, 3), np.uint8))  # the first inference is slow
         return describe

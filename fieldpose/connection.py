@@ -5,16 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from types import TracebackType
-from typing import Literal
 
 import numpy as np
 
-from fieldpose.bus.messages import CameraInfo, CameraOrigin, Frame, Prior, State
+from fieldpose.bus.messages import CameraOrigin, Encoding, Prior, State
 from fieldpose.bus.ports import Inbox, Outbox, first_header
-from fieldpose.bus.topics import CAMERA_INFO, FRAME, PRIOR, STATE, Address
+from fieldpose.bus.topics import PRIOR, STATE, Address
 from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
 from fieldpose.deploy.processes.endpoints import peer_address
 from fieldpose.errors import GeometryError
+from fieldpose.stages.camera.wire import frame_messages
 from fieldpose.stages.geometry import Camera, is_rigid
 from fieldpose.stages.images import checked_image
 from fieldpose.stages.tracking.wire import RIGID_TOLERANCE
@@ -52,7 +52,7 @@ class Connection:
 
     def publish(
         self, image: np.ndarray, camera: Camera, capture_ns: int | None = None,
-        encoding: Literal["rgb8", "jpeg", "png"] = "rgb8", frame_id: int | None = None,
+        encoding: Encoding = "rgb8", frame_id: int | None = None,
     ) -> int:  # fmt: skip
         """Send a frame: (h, w, 3) uint8 RGB, or the bytes (n,) uint8 of a jpeg or png file. Returns its number.
 
@@ -63,11 +63,8 @@ class Connection:
         frame_id = self._frames if frame_id is None else frame_id
         self._frames = frame_id + 1
         header = first_header(frame_id, time.time_ns() if capture_ns is None else capture_ns)
-        origin = CameraOrigin.CALIBRATED
-        pixels = np.ascontiguousarray(image)
-        frame = Frame(header=header, image=pixels, encoding=encoding, camera=camera, camera_origin=origin)
-        self._outbox.publish(FRAME, frame)
-        self._outbox.publish(CAMERA_INFO, CameraInfo(header=header, camera=camera, camera_origin=origin))
+        for topic, message in frame_messages(header, image, encoding, camera, CameraOrigin.CALIBRATED):
+            self._outbox.publish(topic, message)
         return frame_id
 
     def publish_prior(self, frame_id: int, cam_from_object: np.ndarray) -> None:

@@ -35,8 +35,10 @@ class PoseFinder:
     def __init__(self, field: str | Path, settings: Settings | None = None) -> None:
         settings, path = settings or Settings(), Path(field)
         settings = replace(settings, tracking=replace(settings.tracking, sequence="photos"))
-        views = training_views(load_field(path))
+        loaded = load_field(path)
+        views = training_views(loaded)
         self._parts = Parts(resolve(settings, views, path), together=True)
+        self._parts.field = loaded
         self._calibrator = Calibrator(settings.camera, self._parts.known_cameras())
         self._finder = PartsFinder(self._parts)
 

@@ -19,7 +19,7 @@ class FrameImages:
 
     def of(self, frame: Frame) -> np.ndarray | None:
         """(h, w, 3) uint8 RGB; None where its bytes are no image of the frame's size."""
-        key = (frame.header.frame_id, frame.header.capture_ns)
+        key = frame.header.frame_key
         if key not in self._images:
             self._images[key] = frame_image(frame)
         return self._images[key]

@@ -29,7 +29,6 @@ from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedView
 from fieldpose.stages.nerf.torch_renderer import TorchRenderer
 from fieldpose.stages.nerf.training import colours, psnr
 
-SIZES = (200, 320, 400, 800)
 _FINER = 4
 _LOOK = """
 import sys

@@ -6,7 +6,7 @@ import dataclasses
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,6 +20,7 @@ from fieldpose.deploy.graph import (
     BY_NAME,
     CAMERA,
     GRAPH,
+    RECORDER,
     STAGES,
     Launch,
     Process,
@@ -43,7 +44,10 @@ _START_S = 300.0
 
 _Name = Annotated[str, tyro.conf.arg(constructor=tyro.extras.literal_type_from_choices(list(BY_NAME)))]
 _WITH_FIELD = ", ".join(row.name for row in GRAPH if row.needs_field)
-_FIELD = f"The field, for {_WITH_FIELD}, and for the camera, which looks there for cameras that are not calibrated."
+_FIELD = (
+    f"The field, for {_WITH_FIELD}, and for the camera, which looks there for cameras that are not calibrated, "
+    "and the recorder, which keeps what was decided for the field."
+)
 
 
 @dataclass(frozen=True)
@@ -91,9 +95,7 @@ class Options:
 
 
 def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handler]) -> None:
-    settings = options.settings
-    plan, field = _planned(settings, options.field if row.needs_field else None)
-    plan = replace(plan, field=options.field)
+    plan, field = planned(options, row)
     threads = options.threads or threads_of(row, plan.in_flight)
     os.environ.update(thread_environment(threads))
     parts = Parts(plan, threads)
@@ -101,7 +103,7 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
         parts.field = field
     if options.field is not None and row.renders and plan.settings.backend == "numba":
         compile_kernels(options.field, row.name)
-    address = settings.address
+    address = options.settings.address
     # In whatever order they are started, the first frame finds all that work on it.
     passed = tuple(other.name for other in rows_of(plan, recorded=False) if other.name in AT_WORK)
     awaited = options.wait_for if options.wait_for is not None else passed if row.name == CAMERA else ()
@@ -123,10 +125,16 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
         bus.close()
 
 
-def _planned(settings: Settings, path: Path | None) -> tuple[Plan, Field | None]:
+def _plans_by_field(options: Options, row: Process) -> bool:
+    """Whether this process must know the field: for its own work, to record what was decided, or whom to wait for."""
+    return row.needs_field or row.name == RECORDER or (row.name == CAMERA and options.wait_for is None)
+
+
+def planned(options: Options, row: Process) -> tuple[Plan, Field | None]:
     """The plan of a process, and the field, which only a process that needs it reads: that takes half a second."""
-    if path is None:
-        return resolve(settings, None), None
+    settings, path = options.settings, options.field
+    if path is None or not _plans_by_field(options, row):
+        return resolve(settings, None, path), None
     from fieldpose.stages.nerf.field import load_field
     from fieldpose.stages.nerf.training_views import training_views
 

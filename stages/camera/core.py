@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from fieldpose.bus.messages import CameraOrigin
+from fieldpose.bus.messages import CameraOrigin, Encoding
 from fieldpose.errors import ConfigError
 from fieldpose.stages.camera.config import CameraConfig, Pace
 from fieldpose.stages.geometry import Camera
@@ -34,7 +34,7 @@ class CapturedFrame:
 
     frame_id: int
     image: np.ndarray
-    encoding: Literal["rgb8", "jpeg", "png"]
+    encoding: Encoding
     camera: Camera
     name: str
     at_ns: int | None = None

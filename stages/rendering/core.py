@@ -14,7 +14,7 @@ from fieldpose.stages.geometry.arrays import Points64, Transform
 from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedView
 from fieldpose.stages.rendering.config import RenderingConfig
 
-__all__ = ["RenderingConfig", "SourcedView", "ViewSource", "view_camera"]
+__all__ = ["RenderingConfig", "SourcedView", "ViewSource", "opacity_bytes", "view_camera"]
 
 _PROBES = 256
 
@@ -79,6 +79,11 @@ class ViewSource:
 def view_camera(camera: Camera, size: int) -> Camera:
     """The camera without distortion, its longer side at most `size` pixels."""
     return camera.undistorted().shrunk(size)
+
+
+def opacity_bytes(opacity: np.ndarray) -> np.ndarray:
+    """Opacity 0..1, as a view on the bus has it: uint8 0..255."""
+    return np.rint(opacity * 255).astype(np.uint8)
 
 
 @dataclass(frozen=True)

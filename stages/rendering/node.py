@@ -9,7 +9,7 @@ import numpy as np
 from fieldpose.bus.messages import GuessReason, Message, Reason, View
 from fieldpose.bus.node import Joined, JoinedHandler
 from fieldpose.bus.topics import GUESS, VIEW
-from fieldpose.stages.rendering.core import ViewSource
+from fieldpose.stages.rendering.core import ViewSource, opacity_bytes
 
 
 class RenderingNode(JoinedHandler):
@@ -35,5 +35,5 @@ class RenderingNode(JoinedHandler):
         view = sourced.view
         return View(
             header=joined.header, view_id=sourced.view_id, cam_from_object=view.cam_from_object, camera=view.camera,
-            rgb=view.rgb, depth=view.depth, opacity=np.rint(view.opacity * 255).astype(np.uint8),
+            rgb=view.rgb, depth=view.depth, opacity=opacity_bytes(view.opacity),
         )  # fmt: skip

@@ -21,7 +21,7 @@ from fieldpose.stages.tracking.trust import Trust
 
 _NEAR_POSES = 4
 _KEPT_ALIKE = 16
-"""Frames for which it is known which views look like them; more are never in flight."""
+"""The newest frames for which it is known which views look like them."""
 
 
 class VideoPolicy:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from support.commands import fieldpose, save_empty_field
 
 from fieldpose.deploy.cli import COMMANDS, main, parse
 from fieldpose.deploy.commands import run, stage
+from fieldpose.deploy.graph import BY_NAME
 from fieldpose.errors import UsageError
 
 
@@ -28,6 +30,21 @@ def only_line(capsys: pytest.CaptureFixture[str]) -> str:
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1, lines
     return lines[0]
+
+
+@pytest.mark.parametrize("name", ["recorder", "camera", "tracking"])
+def test_a_stage_plans_by_what_the_field_remembers(name: str, field: Path) -> None:
+    """So that the recorder keeps what was decided, and the camera waits for no process that has nothing to do."""
+    plan, _ = stage.planned(stage.Options(name, field=field), BY_NAME[name])
+    assert not plan.looks
+    assert "train it again" in plan.notes["retrieval"]
+
+
+@pytest.mark.parametrize("options", [stage.Options("pnp"), stage.Options("camera", wait_for=("observer",))])
+def test_a_stage_without_a_use_for_the_field_does_not_read_it(options: stage.Options, tmp_path: Path) -> None:
+    unread = tmp_path / "unread.safetensors"
+    plan, read = stage.planned(replace(options, field=unread), BY_NAME[options.name])
+    assert (plan.field, read) == (unread, None)
 
 
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,6 +12,10 @@ from hypothesis import settings
 from jaxtyping import install_import_hook
 
 CHECKED = (
+    "fieldpose.stages.alignment.images",
+    "fieldpose.stages.alignment.landmarks",
+    "fieldpose.stages.alignment.placing",
+    "fieldpose.stages.alignment.views",
     "fieldpose.stages.geometry.cameras",
     "fieldpose.stages.geometry.jacobians",
     "fieldpose.stages.geometry.sampling",
@@ -19,10 +23,9 @@ CHECKED = (
     "fieldpose.stages.lifting.core",
     "fieldpose.stages.matching.core",
     "fieldpose.stages.nerf.rendering_api",
-    "fieldpose.stages.pnp.alignment",
+    "fieldpose.stages.pnp.aligner",
     "fieldpose.stages.pnp.consensus",
     "fieldpose.stages.pnp.core",
-    "fieldpose.stages.pnp.landmarks",
     "fieldpose.stages.refinement.core",
     "fieldpose.stages.refinement.photometric",
     "fieldpose.stages.rendering.core",

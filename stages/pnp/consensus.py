@@ -12,15 +12,15 @@ import numpy as np
 import poselib
 from jaxtyping import Float64
 
+from fieldpose.stages.alignment.agreement import fit_agreeing
+from fieldpose.stages.alignment.least_squares import CONVERGED, PoseFit, isotropic
 from fieldpose.stages.geometry import Camera, is_rigid
 from fieldpose.stages.geometry.arrays import Indices, Pixels, Pixels64, Points64, Transform, Values
 from fieldpose.stages.pnp import constants
-from fieldpose.stages.pnp.alignment import Aligner
+from fieldpose.stages.pnp.aligner import Aligner
 from fieldpose.stages.pnp.config import PnpConfig
-from fieldpose.stages.pnp.least_squares import CONVERGED, PoseFit, fit_pose, isotropic, reprojection_errors_px
 
 MIN_POINTS = 4
-_ROUNDS = 3
 _NEAR_ENOUGH = 1e-3
 _ENOUGH = 300
 """So many points are enough to come nearer; all of them are looked for at the end."""
@@ -78,7 +78,7 @@ def agreed_pose(
     start = _ransac(pixels, points[index], plain, threshold, config)
     if start is None:
         return None
-    fit, inliers = _local_optimisation(pixels, points[index], plain, start, matrices, threshold, config)
+    fit, inliers = fit_agreeing(pixels, points[index], plain, start, matrices, threshold, _least(config))
     if fit is None or inliers.sum() < config.min_inlier_ratio * len(points):
         return None
     index = index[inliers]
@@ -140,9 +140,9 @@ def _aligned(
         placed = aligner.place(found.fit.cam_from_object, level, None if last else _ENOUGH)
         pixels, usable = camera.without_distortion(placed.pixels)  # a search may end where the lens has no inverse
         index, pixels = placed.index[usable], pixels[usable]
-        fit, inliers = _local_optimisation(
+        fit, inliers = fit_agreeing(
             pixels, points[index], camera.undistorted(), found.fit.cam_from_object, placed.weights[usable], spread_px,
-            config, CONVERGED if last else _NEAR_ENOUGH,
+            _least(config), CONVERGED if last else _NEAR_ENOUGH,
         )  # fmt: skip
         if fit is None:
             return None
@@ -150,6 +150,10 @@ def _aligned(
         found = Consensus(fit, index[inliers], placed.pixels[usable][inliers], agreed.matched, in_frame)
     rms = float(np.sqrt((found.fit.errors[0] ** 2).sum(axis=1).mean()))
     return found if rms <= constants.ALIGN_SPREAD * rounds[-1][1] else None
+
+
+def _least(config: PnpConfig) -> int:
+    return max(config.min_inliers, MIN_POINTS)
 
 
 def _ransac(
@@ -168,27 +172,3 @@ def _ransac(
     pose = np.eye(4)
     pose[:3] = found.Rt
     return pose if about["num_inliers"] >= MIN_POINTS and is_rigid(pose) else None
-
-
-def _local_optimisation(
-    pixels: np.ndarray,
-    points: np.ndarray,
-    camera: Camera,
-    cam_from_object: np.ndarray,
-    weights: np.ndarray,
-    threshold: float,
-    config: PnpConfig,
-    converged: float = CONVERGED,
-) -> tuple[PoseFit | None, np.ndarray]:
-    """Fit the inliers and choose them anew by the fit, in turn; None where they become too few."""
-    pose, fit, inliers = cam_from_object, None, np.zeros(len(pixels), bool)
-    for _ in range(_ROUNDS):
-        agreeing = reprojection_errors_px(pixels, points, camera, pose) <= threshold
-        if agreeing.sum() < max(config.min_inliers, MIN_POINTS):
-            return None, agreeing
-        if fit is not None and np.array_equal(agreeing, inliers):
-            break
-        inliers = agreeing
-        fit = fit_pose(pixels[inliers], points[inliers], camera, pose, weights[inliers], converged)
-        pose = fit.cam_from_object
-    return fit, inliers

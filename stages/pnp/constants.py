@@ -12,24 +12,8 @@ MIN_SPREAD = 0.01
 """Inliers must extend at least this share of the image's longer side across their narrowest direction (std)."""
 CONFIDENCE_POWER = 2.0
 """Squared errors are weighted by the matches' confidence to this power; 0: all the same."""
-SHARED_ERROR = 0.6
-"""How far neighbouring matches err together, as a multiple of the inliers' residuals; found on several scenes."""
-SHARED_ERROR_BY_ANGLE = 0.8
-"""What is added to it for each radian between the directions of view: what is seen from elsewhere looks different
-in ways that neighbours have in common."""
-ALIGN_HALF = 4
-"""A patch has this many samples to either side of its middle."""
-ALIGN_STEPS = 8
-"""At most so many steps to find a patch."""
-ALIGN_SIMILARITY = 0.75
-"""Patches that correlate less are not found."""
-ALIGN_FLOOR_PX = 0.02
-"""No patch is found more exactly, in pixels of the view; with little texture it is as much less exact, and in the
-direction, as its grey values say."""
-ALIGN_PX = 1.5
-"""Largest reprojection error of a point that was found, in pixels of the view."""
 ALIGN_SPREAD = 0.63
-"""Largest root mean square of the errors of what was found, as a share of align_px: points that are found by
+"""Largest root mean square of the errors of what was found, as a share of FOUND_PX: points that are found by
 chance lie anywhere, which makes it 0.71."""
 MIN_UNALIGNED = 0.3
 """Least share of matches that agree on a pose which no search in the frame bears out, as where that is blurred."""

@@ -8,13 +8,14 @@ import numpy as np
 from jaxtyping import Bool
 
 from fieldpose.bus.messages import Reason
-from fieldpose.stages.geometry import Camera, camera_centre, twist_covariance, viewing_angles
+from fieldpose.stages.alignment.agreement import covariance_of
+from fieldpose.stages.alignment.landmarks import landmarks
+from fieldpose.stages.geometry import Camera, camera_centre, viewing_angles
 from fieldpose.stages.geometry.arrays import Covariance, Pixels, Pixels32, Points, Transform, Values
 from fieldpose.stages.pnp import constants
-from fieldpose.stages.pnp.alignment import Aligner, Pictures
+from fieldpose.stages.pnp.aligner import Aligner, Pictures
 from fieldpose.stages.pnp.config import PnpConfig
 from fieldpose.stages.pnp.consensus import MIN_POINTS, agreed_pose, confirmed_pose
-from fieldpose.stages.pnp.landmarks import landmarks
 
 __all__ = ["Pictures", "PnpConfig", "PnpResult", "solve", "warm_up"]
 
@@ -65,25 +66,25 @@ def solve(
         found = agreed_pose(pixels_in_frame, points, camera, weights, config)
     else:
         seen_from = pictures.cam_from_object
-        points = np.concatenate([points, landmarks(pictures, config.landmarks)])
+        points = np.concatenate([points, _landmarks(pictures, config.landmarks)])
         aligner = Aligner(pictures, points, camera, config)
         found = confirmed_pose(pixels_in_frame, points, camera, weights, aligner, config)
     if found is None:
         return Reason.NO_CONSENSUS
     fit, pose = found.fit, found.fit.cam_from_object
     angles = viewing_angles(points[found.index], pose if seen_from is None else seen_from, pose)
-    shared = constants.SHARED_ERROR + constants.SHARED_ERROR_BY_ANGLE * float(np.median(angles))
-    residuals, jacobian = fit.errors
-    covariance = twist_covariance(
-        jacobian, fit.weights, found.pixels, longer_side, fit.variance, shared**2 * fit.variance_px
-    )
+    covariance = covariance_of(fit, found.pixels, longer_side, float(np.median(angles)))
     distance = float(np.median(np.linalg.norm(points[found.index] - camera_centre(pose), axis=1)))
     if not _plausible(covariance, found.pixels, longer_side, distance, config):
         return Reason.IMPLAUSIBLE_POSE
     inliers, in_frame = np.zeros(count, bool), found.pixels.astype(np.float32)
     inliers[found.index[found.index < count]] = True
-    rms = float(np.sqrt((residuals**2).sum(axis=1).mean()))
+    rms = float(np.sqrt((fit.errors[0] ** 2).sum(axis=1).mean()))
     return PnpResult(pose, inliers, in_frame, found.looked_for, rms, covariance)
+
+
+def _landmarks(pictures: Pictures, most: int) -> np.ndarray:
+    return landmarks(pictures.grey, pictures.depth, pictures.camera, pictures.cam_from_object, most)
 
 
 def warm_up(config: PnpConfig) -> None:

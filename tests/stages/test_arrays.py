@@ -7,14 +7,14 @@ import pytest
 from jaxtyping import TypeCheckError
 
 from fieldpose.bus.messages import GuessReason
+from fieldpose.stages.alignment.landmarks import landmarks
 from fieldpose.stages.geometry import Camera, points_at_depth, rays
 from fieldpose.stages.lifting.core import depth_at
 from fieldpose.stages.matching.core import visible_mask
 from fieldpose.stages.nerf.rendering_api import RenderedView
-from fieldpose.stages.pnp.alignment import Pictures
+from fieldpose.stages.pnp.aligner import Pictures
 from fieldpose.stages.pnp.consensus import agreed_pose
 from fieldpose.stages.pnp.core import PnpConfig, solve
-from fieldpose.stages.pnp.landmarks import landmarks
 from fieldpose.stages.refinement.core import RefinementResult
 from fieldpose.stages.refinement.photometric import keypoint_region
 from fieldpose.stages.rendering.core import ViewSource
@@ -55,11 +55,11 @@ def test_a_wrong_array_is_refused(call: Callable[[], object]) -> None:
 
 
 def test_right_arrays_are_taken() -> None:
-    assert landmarks(PICTURES, 0).shape == (0, 3)
+    assert landmarks(PICTURES.grey, DEPTH, CAMERA, POSE, 0).shape == (0, 3)
     assert points_at_depth(CAMERA, POSE, PIXELS, np.ones(5)).shape == (5, 3)
 
 
 def test_a_wrong_answer_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fieldpose.stages.pnp.landmarks.points_at_depth", lambda *_: np.zeros((3, 2)))
+    monkeypatch.setattr("fieldpose.stages.alignment.landmarks.points_at_depth", lambda *_: np.zeros((3, 2)))
     with pytest.raises(TypeCheckError, match="return value"):
-        landmarks(PICTURES, 0)
+        landmarks(PICTURES.grey, DEPTH, CAMERA, POSE, 0)

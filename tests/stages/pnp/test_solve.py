@@ -8,10 +8,7 @@ from scipy import stats
 
 from fieldpose.bus.messages import Reason
 from fieldpose.errors import ConfigError
-from fieldpose.stages.geometry import Camera, exp_se3, inverse, log_se3, look_at, rotation_error_deg, translation_error
-from fieldpose.stages.pnp import constants
-from fieldpose.stages.pnp.core import PnpConfig, PnpResult, solve
-from fieldpose.stages.pnp.least_squares import (
+from fieldpose.stages.alignment.least_squares import (
     exp_se3_times,
     fit_pose,
     huber_cost,
@@ -20,6 +17,9 @@ from fieldpose.stages.pnp.least_squares import (
     reprojection,
     weighted_lengths,
 )
+from fieldpose.stages.geometry import Camera, exp_se3, inverse, log_se3, look_at, rotation_error_deg, translation_error
+from fieldpose.stages.pnp import constants
+from fieldpose.stages.pnp.core import PnpConfig, PnpResult, solve
 
 Maker = Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]
 CAMERA = Camera(400, 300, 420.0, 430.0, 201.0, 147.0)

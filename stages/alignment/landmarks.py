@@ -8,9 +8,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from fieldpose.stages.geometry import points_at_depth
-from fieldpose.stages.geometry.arrays import Depth, Grey, Pixels32, Points64
-from fieldpose.stages.pnp.alignment import Pictures
+from fieldpose.stages.geometry import Camera, points_at_depth
+from fieldpose.stages.geometry.arrays import Depth, Grey, Pixels32, Points64, Transform
 
 _LEAST_QUALITY = 0.01
 _APART_PX = 4
@@ -19,14 +18,15 @@ _LARGEST_STEP = 0.1
 _AROUND = np.ones((3, 3), np.uint8)
 
 
-def landmarks(pictures: Pictures, most: int) -> Points64:
-    """Points of the object, at most so many: those whose surroundings in the view have the most texture.
+def landmarks(grey: Grey, depth: Depth, camera: Camera, cam_from_object: Transform, most: int) -> Points64:
+    """Points of the object, at most so many: those whose surroundings in the view have the most texture, best first.
 
+    Grey values, depth and camera are the view's.
     None is taken where the depth steps between neighbours by a tenth or more, as it does where the object ends.
     """
-    pixels = _corners(pictures.grey, pictures.depth, most)
+    pixels = _corners(grey, depth, most)
     column, row = pixels.astype(int).T
-    points = points_at_depth(pictures.camera, pictures.cam_from_object, pixels, pictures.depth[row, column])
+    points = points_at_depth(camera, cam_from_object, pixels, depth[row, column])
     return points.astype(np.float64)
 
 

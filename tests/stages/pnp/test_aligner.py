@@ -8,10 +8,13 @@ from support.analytic_scene import AnalyticScene, camera, viewpoint
 
 from fieldpose.bus.messages import Reason
 from fieldpose.errors import GeometryError
+from fieldpose.stages.alignment import constants as alignment_constants
+from fieldpose.stages.alignment.placing import Placed
+from fieldpose.stages.alignment.views import inverse_depth_slopes
 from fieldpose.stages.geometry import Camera, exp_se3, perturb, rays, rotation_error_deg, translation_error
 from fieldpose.stages.nerf.rendering_api import RenderedView
 from fieldpose.stages.pnp import constants
-from fieldpose.stages.pnp.alignment import Aligner, Pictures, Placed, inverse_depth_slopes
+from fieldpose.stages.pnp.aligner import Aligner, Pictures
 from fieldpose.stages.pnp.core import PnpConfig, PnpResult, solve
 
 TRUTH = viewpoint(25.0, 38.0)
@@ -266,7 +269,7 @@ def test_nothing_is_found_beyond_the_frame(
     view: RenderedView, frame: np.ndarray, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A camera turned so that many points are at its image's border."""
-    monkeypatch.setattr(constants, "ALIGN_SIMILARITY", -1.0)
+    monkeypatch.setattr(alignment_constants, "SIMILARITY", -1.0)
     aligner = Aligner(pictures(view, frame), points, LENS, PnpConfig())
     for angle in (0.2, 0.25, 0.3):
         placed = aligner.place(exp_se3([0, 0, 0, 0, angle, 0]) @ TRUTH, 2)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
+from fieldpose.stages.alignment import landmarks as of_views
 from fieldpose.stages.geometry import rays
 from fieldpose.stages.nerf.rendering_api import RenderedView
-from fieldpose.stages.pnp.alignment import Pictures
-from fieldpose.stages.pnp.landmarks import landmarks
+from fieldpose.stages.pnp.aligner import Pictures
 
 VIEW = camera(200)
 POSE = viewpoint(25.0, 38.0)
@@ -29,6 +29,10 @@ def view(scene: AnalyticScene) -> RenderedView:
 @pytest.fixture(scope="module")
 def pictures(view: RenderedView) -> Pictures:
     return Pictures(view.rgb, view.depth, VIEW, POSE, view.rgb)
+
+
+def landmarks(pictures: Pictures, most: int) -> np.ndarray:
+    return of_views.landmarks(pictures.grey, pictures.depth, pictures.camera, pictures.cam_from_object, most)
 
 
 def pixels_of(points: np.ndarray) -> np.ndarray:

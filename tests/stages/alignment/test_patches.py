@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldpose.stages.pnp.patches import find_patches
+from fieldpose.stages.alignment.patches import find_patches
 
 
 def texture(rng: np.random.Generator, size: tuple[int, int] = (90, 110), blur: float = 1.5) -> np.ndarray:

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.analytic_scene import camera
 
+from fieldpose.stages.alignment.least_squares import intrinsics_of
+from fieldpose.stages.alignment.warps import warp_patches
 from fieldpose.stages.geometry import Camera, exp_se3
-from fieldpose.stages.pnp.least_squares import intrinsics_of
-from fieldpose.stages.pnp.warps import warp_patches
 
 VIEW = camera(200)
 

@@ -8,6 +8,7 @@ from scipy import stats
 
 from fieldpose.bus.messages import Reason
 from fieldpose.errors import ConfigError
+from fieldpose.stages.alignment import agreement
 from fieldpose.stages.alignment.least_squares import (
     exp_se3_times,
     fit_pose,
@@ -18,7 +19,6 @@ from fieldpose.stages.alignment.least_squares import (
     weighted_lengths,
 )
 from fieldpose.stages.geometry import Camera, exp_se3, inverse, log_se3, look_at, rotation_error_deg, translation_error
-from fieldpose.stages.pnp import constants
 from fieldpose.stages.pnp.core import PnpConfig, PnpResult, solve
 
 Maker = Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray]]
@@ -84,7 +84,7 @@ def test_the_covariance_is_that_of_the_error(noise_px: float, shared: float, mon
         column, row = np.clip(pixels // 50, 0, 7).astype(int).T
         pixels = pixels + offsets[row, column].astype(np.float32)
         own = shared / np.hypot(1, shared)  # residuals tell the sum of both errors
-        monkeypatch.setattr(constants, "SHARED_ERROR", own)
+        monkeypatch.setattr(agreement, "SHARED_ERROR", own)
         result = solved(solve(pixels, points, CAMERA, PnpConfig(threshold_px=20.0)))
         twist = log_se3(solved(result).cam_from_object @ inverse(POSE))
         assert result.covariance is not None

@@ -301,10 +301,36 @@ class Failure(Message, kw_only=True):
     reason: Reason
 
 
+class Followed(Message, kw_only=True):
+    """A frame's pose from points of views that exist, as measured: `State` has it filtered over time.
+
+    pixels_in_frame: where points were looked for, in the frame's own pixels; found: which of them were found.
+    level: how coarse the images were, 0 for not at all; blurred frames show no more.
+    """
+
+    cam_from_object: np.ndarray
+    covariance: np.ndarray
+    pixels_in_frame: np.ndarray
+    found: np.ndarray
+    residual_px: float
+    level: int
+    _arrays: ClassVar = {
+        "cam_from_object": POSE,
+        "covariance": COVARIANCE,
+        "pixels_in_frame": ("float32", (None, 2)),
+        "found": ("bool", (None,)),
+    }
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_equal("length", {name: len(getattr(self, name)) for name in ("pixels_in_frame", "found")})
+
+
 class State(Message, kw_only=True):
     """What tracking believes after each frame, and what it has counted at its door since it started.
 
     A pose with a score of 0 was not measured but carried on from before; `reason` says why nothing was measured.
+    level: how much following does less than it might, for want of time; 0 for nothing less.
     """
 
     state: TrackingState
@@ -318,6 +344,7 @@ class State(Message, kw_only=True):
     finished: int
     dropped_at_the_door: int
     lost: int
+    level: int = 0
     _arrays: ClassVar = {"cam_from_object": POSE, "covariance": COVARIANCE}
 
 

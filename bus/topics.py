@@ -96,12 +96,13 @@ CORRESPONDENCES = Topic("correspondences", _PIPELINE + "correspondences", messag
 ESTIMATE = Topic("estimate", _PIPELINE + "estimate", messages.Estimate)
 POSE = Topic("pose", _PIPELINE + "pose", messages.Pose, max_bytes=_SMALL)
 FAILURE = Topic("failure", _PIPELINE + "failure", messages.Failure, max_bytes=_SMALL)
+FOLLOWED = Topic("followed", _PIPELINE + "followed", messages.Followed, max_bytes=_SMALL)
 STATE = Topic("state", _PIPELINE + "state", messages.State, max_bytes=_SMALL)
 STATS = Topic("stats", "{site}/stats/{object}/{camera}/{stage}", messages.Stats, capacity=256, max_bytes=16 << 10)
 
 ALL: tuple[Topic[Any], ...] = (
     FRAME, CAMERA_INFO, TRUTH, PRIOR, SEARCH, RETRIEVED, GUESS, VIEW, MATCHES, CORRESPONDENCES, ESTIMATE, POSE, FAILURE,
-    STATE, STATS,
+    FOLLOWED, STATE, STATS,
 )  # fmt: skip
 BY_NAME: dict[str, Topic[Any]] = {topic.name: topic for topic in ALL}
 

@@ -24,6 +24,7 @@ from fieldpose.bus.topics import (
     CORRESPONDENCES,
     ESTIMATE,
     FAILURE,
+    FOLLOWED,
     FRAME,
     GUESS,
     MATCHES,
@@ -117,7 +118,7 @@ def _perturbation(parts: Parts, launch: Launch) -> Handler:
 def _tracking(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.tracking.node import TrackingNode
 
-    return TrackingNode(parts.tracker)
+    return TrackingNode(parts.tracker, parts.see())
 
 
 def _retrieval(parts: Parts, launch: Launch) -> Handler:
@@ -168,8 +169,8 @@ GRAPH: tuple[Process, ...] = (
         wanted=lambda plan: plan.begins.disturbance is not None,
     ),
     Process(
-        "tracking", _tracking, reads=(CAMERA_INFO, PRIOR, RETRIEVED, POSE, FAILURE), writes=(SEARCH, GUESS, STATE),
-        needs_field=True,
+        "tracking", _tracking, reads=(FRAME, CAMERA_INFO, PRIOR, VIEW, RETRIEVED, POSE, FAILURE),
+        writes=(SEARCH, GUESS, FOLLOWED, STATE), needs_field=True,
     ),
     Process(
         "retrieval", _retrieval, reads=(SEARCH, FRAME), writes=(RETRIEVED, FAILURE), needs_field=True,

@@ -18,6 +18,7 @@ from fieldpose.stages.wire import FrameImages
 
 # A process imports what its own handlers need, and no more: torch and numba take seconds.
 if TYPE_CHECKING:
+    from fieldpose.stages.following.wire import See
     from fieldpose.stages.matching.core import PairMatcher
     from fieldpose.stages.nerf.field import Field
     from fieldpose.stages.nerf.rendering_api import RayRenderer
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from fieldpose.stages.rendering.core import ViewSource
     from fieldpose.stages.retrieval.node import DescribeFrame
     from fieldpose.stages.tracking.core import Tracker
+    from fieldpose.stages.tracking.following import FollowingTracker
 
 _KEPT_VIEWS = 128
 
@@ -94,6 +96,13 @@ class Parts:
         self._limit_torch()
         return PairMatcher(build_matcher(self.settings.matching), self.settings.matching, not self.plan.independent)
 
+    def see(self) -> See | None:
+        """How following looks at frames; None where none are followed."""
+        from fieldpose.stages.following.wire import small_frame
+
+        longer_side = self.settings.rendering.longer_side
+        return (lambda frame: small_frame(frame, longer_side)) if self.plan.follows else None
+
     def describe(self) -> DescribeFrame:
         """What retrieval compares frames by; by the features that are matched anyway, where these are the same."""
         from fieldpose.stages.rendering.core import view_camera
@@ -115,12 +124,16 @@ class Parts:
 
         return describe
 
-    def tracker(self) -> Tracker:
+    def tracker(self) -> Tracker | FollowingTracker:
         """Tracking, for the kind of sequence that the plan has."""
-        from fieldpose.stages.tracking.beginning import make_policy
+        from fieldpose.stages.tracking.beginning import make_followed_policy, make_policy
         from fieldpose.stages.tracking.core import Tracker
+        from fieldpose.stages.tracking.following import FollowingTracker
 
-        config = self.settings.tracking
+        config, following = self.settings.tracking, self.settings.following
+        if self.plan.follows:
+            policy = make_followed_policy(config, following, self.training_views, self.plan.looks)
+            return FollowingTracker(config, following, policy)
         return Tracker(config, make_policy(config, self.training_views, self.plan.looks))
 
     @cached_property

@@ -11,6 +11,7 @@ from fieldpose.deploy.settings import Settings
 from fieldpose.errors import ConfigError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.sources import is_video, knows_truth
+from fieldpose.stages.following.config import FollowingConfig
 from fieldpose.stages.nerf.backend import resolved
 from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.refinement.config import RefinementConfig
@@ -28,12 +29,14 @@ Sequence = Literal["video", "photos"]
 class Plan:
     """A pipeline to be run: its field, and settings with nothing left open but the pace of a source that is elsewhere.
 
-    looks: whether retrieval can be asked. notes: what was decided, and why, by name.
+    looks: whether retrieval can be asked. follows: whether every frame is followed. notes: what was decided, and why, by
+    name.
     """
 
     settings: Settings
     field: Path | None = None
     looks: bool = True
+    follows: bool = False
     begins: Beginning = dataclasses.field(default_factory=Beginning)
     notes: dict[str, str] = dataclasses.field(default_factory=dict)
 
@@ -44,8 +47,8 @@ class Plan:
 
     @property
     def in_flight(self) -> int:
-        """How many frames are worked on at once: in lockstep one, whatever the depth is."""
-        return 1 if self.settings.camera.pace == "lockstep" else self.settings.tracking.depth
+        """How many frames are solved at once: one in lockstep, and where all are followed, whatever the depth is."""
+        return 1 if self.follows or self.settings.camera.pace == "lockstep" else self.settings.tracking.depth
 
 
 def resolve(settings: Settings, views: TrainingViews | None, field: Path | None = None) -> Plan:
@@ -64,16 +67,18 @@ def resolve(settings: Settings, views: TrainingViews | None, field: Path | None 
     looks = _looks(settings, views, begins, notes)
     backend = resolved(settings.backend)
     notes["backend"] = f"{backend}{' (auto)' if settings.backend == 'auto' else ''}"
+    camera = _camera(settings.camera, notes)
+    follows = _follows(settings.following, sequence, begins, camera, notes)
     resolved_settings = replace(
         settings,
         backend=backend,
-        camera=_camera(settings.camera, notes),
+        camera=camera,
         tracking=replace(settings.tracking, sequence=sequence, guess=absolute(settings.tracking.guess)),
-        rendering=_rendering(settings.rendering, sequence, sequence == "photos" or begins.by_frame, notes),
+        rendering=_rendering(settings.rendering, sequence, sequence == "photos" or begins.by_frame, follows, notes),
         matching=replace(settings.matching, device=_device(settings.matching.device, backend)),
         refinement=_refinement(settings.refinement, sequence, notes),
     )
-    return Plan(resolved_settings, field, looks, begins, notes)
+    return Plan(resolved_settings, field, looks, follows, begins, notes)
 
 
 def _sequence(settings: Settings, notes: dict[str, str]) -> Sequence:
@@ -106,16 +111,33 @@ def _camera(config: CameraConfig, notes: dict[str, str]) -> CameraConfig:
     return config
 
 
+def _follows(
+    config: FollowingConfig, sequence: Sequence, begins: Beginning, camera: CameraConfig, notes: dict[str, str]
+) -> bool:
+    """Following answers at once, so that a source that waits for answers would leave no time for solving."""
+    if sequence == "photos" or begins.by_frame:
+        why = "photos" if sequence == "photos" else "each frame has a guess of its own"
+        if config.when == "always":
+            raise ConfigError(f"following: always, but these are not frames of a video to follow: {why}")
+    elif config.when == "auto":
+        why = "" if camera.pace != "lockstep" else "lockstep: each frame is solved"
+    else:
+        why = "" if config.when == "always" else "never"
+    notes["following"] = f"off ({why})" if why else "every frame, solving beside it"
+    return not why
+
+
 def _rendering(
-    config: RenderingConfig, sequence: Sequence, independent: bool, notes: dict[str, str]
+    config: RenderingConfig, sequence: Sequence, independent: bool, follows: bool, notes: dict[str, str]
 ) -> RenderingConfig:
     size, angle_deg = config.size, config.reuse_angle_deg
     why_size = why_angle = ""
     if size == 0:
         size, why_size = VIDEO_VIEW_SIZE if sequence == "video" else PHOTO_VIEW_SIZE, f" (auto: {sequence})"
     if angle_deg is None:
-        angle_deg = 0.0 if independent else VIDEO_REUSE_DEG
-        why_angle = f" (auto: {'frames stand each by itself' if independent else sequence})"
+        angle_deg = 0.0 if independent or follows else VIDEO_REUSE_DEG
+        why = "following remembers them" if follows else "frames stand each by itself" if independent else sequence
+        why_angle = f" (auto: {why})"
     notes["view size"] = f"{size}{why_size}"
     told = f"within {angle_deg:g} degrees" if angle_deg > 0 else "at the very same pose alone"
     notes["views used again"] = f"{told}{why_angle}"

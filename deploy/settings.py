@@ -19,6 +19,7 @@ import msgspec
 from fieldpose.bus.topics import Address
 from fieldpose.errors import ConfigError
 from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.following.config import FollowingConfig
 from fieldpose.stages.geometry import Limit
 from fieldpose.stages.lifting.config import LiftingConfig
 from fieldpose.stages.matching.core import MatchingConfig
@@ -42,6 +43,7 @@ class Settings:
     address: Address = field(default_factory=Address)
     camera: CameraConfig = field(default_factory=lambda: CameraConfig(source=""))
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    following: FollowingConfig = field(default_factory=FollowingConfig)
     retrieval: RetrievalConfig = field(default_factory=RetrievalConfig)
     rendering: RenderingConfig = field(default_factory=RenderingConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)

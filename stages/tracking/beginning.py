@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 
 from fieldpose.errors import ConfigError
+from fieldpose.stages.following.config import FollowingConfig
 from fieldpose.stages.geometry import is_rigid, nearest_rigid
 from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.followed import FollowedPolicy
 from fieldpose.stages.tracking.photos import PhotoPolicy
 from fieldpose.stages.tracking.policy import Policy
 from fieldpose.stages.tracking.priors import Priors
@@ -81,6 +83,14 @@ def make_policy(config: TrackingConfig, views: TrainingViews, looks: bool = Fals
     begins = beginning(config.guess, views)
     policy = PhotoPolicy if config.sequence == "photos" or begins.by_frame else VideoPolicy
     return policy(config, views, Priors(begins.by_frame, begins.frames), begins.start, looks)
+
+
+def make_followed_policy(
+    config: TrackingConfig, following: FollowingConfig, views: TrainingViews, looks: bool = False
+) -> FollowedPolicy:
+    """The policy for a video whose every frame is followed. Raises ConfigError."""
+    begins = beginning(config.guess, views)
+    return FollowedPolicy(config, following, views, Priors(), begins.start, looks)
 
 
 def disturbance(spec: str) -> Disturbance:

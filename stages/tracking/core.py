@@ -54,12 +54,16 @@ class GuessOrder:
 
 @dataclass(frozen=True)
 class StateReport:
-    """A frame has left: finished, lost on its way, or without a guess; what is believed now."""
+    """A frame has left: finished, lost on its way, or without a guess; what is believed now.
+
+    level: how much less than it might following has done.
+    """
 
     frame: FrameInfo
     pass_index: int
     belief: Belief
     counts: Counts
+    level: int = 0
 
 
 @dataclass(frozen=True)

@@ -3,33 +3,60 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
+import cv2
+import numpy as np
+
 from fieldpose.bus.logs import Throttle, stage_logger
-from fieldpose.bus.messages import CameraInfo, Failure, Message, Pose, Prior, Retrieved
+from fieldpose.bus.messages import CameraInfo, Failure, Frame, Message, Pose, Prior, Retrieved, View
 from fieldpose.bus.node import Output
 from fieldpose.bus.ports import Sequences
-from fieldpose.bus.topics import CAMERA_INFO, FAILURE, GUESS, POSE, PRIOR, RETRIEVED, SEARCH, STATE, Topic
+from fieldpose.bus.topics import (
+    CAMERA_INFO,
+    FAILURE,
+    FOLLOWED,
+    FRAME,
+    GUESS,
+    POSE,
+    PRIOR,
+    RETRIEVED,
+    SEARCH,
+    STATE,
+    VIEW,
+    Topic,
+)  # fmt: skip
+from fieldpose.stages.following.core import warm_up
+from fieldpose.stages.following.wire import See
 from fieldpose.stages.geometry import is_rigid
 from fieldpose.stages.tracking import core
+from fieldpose.stages.tracking.following import FollowedReport, FollowingTracker
 from fieldpose.stages.tracking.wire import RIGID_TOLERANCE, alike, copied, failed, frame_info, outputs_of, pose_result
 
 
 class TrackingNode:
-    """A Handler around the Tracker that `make_tracker` gives at start."""
+    """A Handler around the tracker that `make_tracker` gives at start.
+
+    follows: every frame is followed, so that frames and views are read with their pixels; `see` makes a frame ready.
+    """
 
     name = "tracking"
-    inputs: tuple[Topic[Any], ...] = (CAMERA_INFO, PRIOR, RETRIEVED, POSE, FAILURE)
-    outputs: tuple[Topic[Any], ...] = (SEARCH, GUESS, STATE)
+    outputs: tuple[Topic[Any], ...] = (SEARCH, GUESS, FOLLOWED, STATE)
 
-    def __init__(self, make_tracker: Callable[[], core.Tracker]) -> None:
-        self._make_tracker = make_tracker
+    def __init__(
+        self, make_tracker: Callable[[], core.Tracker | FollowingTracker], see: See | None = None
+    ) -> None:  # fmt: skip
+        seen = (CAMERA_INFO,) if see is None else (FRAME, VIEW)
+        self.inputs: tuple[Topic[Any], ...] = (*seen, PRIOR, RETRIEVED, POSE, FAILURE)
+        self._make_tracker, self._see = make_tracker, see
         self._sequences = Sequences()
         self._throttle = Throttle(stage_logger(self.name))
 
     def start(self) -> None:
         self._tracker = self._make_tracker()
+        if self._see is not None:
+            warm_up()
 
     def handle(self, topic: Topic[Any], message: Message) -> Iterable[Output]:
         return outputs_of(self._take_in(message, time.time_ns()))
@@ -40,10 +67,17 @@ class TrackingNode:
     def stop(self) -> None:
         """Nothing is held."""
 
-    def _take_in(self, message: Message, now_ns: int) -> list[core.Output]:
+    def _take_in(self, message: Message, now_ns: int) -> Sequence[core.Output | FollowedReport]:
         tracker, header = self._tracker, message.header
         match message:
-            case CameraInfo():
+            case Frame() if isinstance(tracker, FollowingTracker) and self._see is not None:
+                return self._follow(tracker, message, self._see, now_ns)
+            case View() if isinstance(tracker, FollowingTracker):
+                grey, pose = cv2.cvtColor(np.array(message.rgb), cv2.COLOR_RGB2GRAY), copied(message.cam_from_object)
+                depth = np.array(message.depth)
+                tracker.on_view(header.frame_id, message.view_id, grey, depth, message.camera, pose, now_ns)
+                return []
+            case CameraInfo() if isinstance(tracker, core.Tracker):
                 return tracker.on_frame(frame_info(message), now_ns, self._sequences.seen(CAMERA_INFO.name, header))
             case Prior():
                 pose = copied(message.cam_from_object)
@@ -59,3 +93,12 @@ class TrackingNode:
                 return tracker.on_result(failed(message), now_ns)
             case _:
                 raise TypeError(f"tracking takes no {type(message).__name__}")
+
+    def _follow(
+        self, tracker: FollowingTracker, frame: Frame, see: See, now_ns: int
+    ) -> Sequence[core.Output | FollowedReport]:
+        began = time.perf_counter()
+        missed = self._sequences.seen(FRAME.name, frame.header)
+        outputs = tracker.on_frame(frame_info(frame), see(frame), now_ns, missed)
+        tracker.took((time.perf_counter() - began) * 1e3)
+        return outputs

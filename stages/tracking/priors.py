@@ -27,6 +27,10 @@ class Priors:
         while len(self._come) > _KEPT:
             self._come.popitem(last=False)
 
+    def peek(self, frame_id: int) -> np.ndarray | None:
+        """That of a frame, left for `take`; None where none has come (yet)."""
+        return self._come.get(frame_id, self._given.get(frame_id))
+
     def take(self, frame_id: int) -> np.ndarray | None:
         """That of a frame; None where none has come (yet). What has come is for one frame, and used once."""
         return self._come.pop(frame_id, self._given.get(frame_id))

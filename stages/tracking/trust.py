@@ -44,6 +44,12 @@ class Trust:
         """A frame gave no pose, or one that is not believed."""
         self._strike(1.0)
 
+    def lost(self) -> None:
+        """What was believed has turned out to be wrong."""
+        if self.tracked:
+            self.state = TrackingState.LOST
+            self.epoch += 1
+
     def stale(self) -> None:
         """Nothing has been heard for long."""
         if self.state is TrackingState.TRACKING:

@@ -6,17 +6,31 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from fieldpose.bus.messages import CameraInfo, Failure, Guess, Pose, Reason, Retrieved, Search, State
+from fieldpose.bus.messages import (
+    CameraInfo,
+    Failure,
+    Followed,
+    Frame,
+    Guess,
+    Header,
+    Pose,
+    Reason,
+    Retrieved,
+    Search,
+    State,
+)
 from fieldpose.bus.node import Output, first_header
-from fieldpose.bus.topics import GUESS, SEARCH, STATE
+from fieldpose.bus.topics import FOLLOWED, GUESS, SEARCH, STATE
+from fieldpose.stages.following.wire import in_frame
 from fieldpose.stages.geometry import is_rigid
 from fieldpose.stages.tracking import core
+from fieldpose.stages.tracking.following import FollowedReport
 from fieldpose.stages.tracking.policy import Alike, FrameInfo, PoseResult
 
 RIGID_TOLERANCE = 1e-3
 
 
-def frame_info(message: CameraInfo) -> FrameInfo:
+def frame_info(message: CameraInfo | Frame) -> FrameInfo:
     """What the Tracker needs of a frame."""
     header = message.header
     return FrameInfo(header.frame_id, header.capture_ns, message.camera, message.camera_origin)
@@ -50,7 +64,7 @@ def copied(array: np.ndarray) -> np.ndarray:
     return np.array(array, dtype=np.float64)
 
 
-def outputs_of(outputs: Iterable[core.Output]) -> Iterator[Output]:
+def outputs_of(outputs: Iterable[core.Output | FollowedReport]) -> Iterator[Output]:
     """The messages that say what the Tracker wants said."""
     for output in outputs:
         header = first_header(output.frame.frame_id, output.frame.capture_ns, output.pass_index)
@@ -60,8 +74,19 @@ def outputs_of(outputs: Iterable[core.Output]) -> Iterator[Output]:
             case core.GuessOrder(frame=frame, guess=guess):
                 pose = guess.cam_from_object
                 yield GUESS, Guess(header=header, reason=guess.reason, cam_from_object=pose, camera=frame.camera)
+            case FollowedReport():
+                yield FOLLOWED, _followed(header, output)
             case core.StateReport():
                 yield STATE, _state(output)
+
+
+def _followed(header: Header, report: FollowedReport) -> Followed:
+    followed, camera = report.followed, report.frame.camera
+    return Followed(
+        header=header, cam_from_object=followed.cam_from_object, covariance=followed.covariance,
+        pixels_in_frame=in_frame(followed, camera), found=followed.found, residual_px=followed.residual_px,
+        level=followed.level,
+    )  # fmt: skip
 
 
 def _state(report: core.StateReport) -> State:
@@ -79,4 +104,5 @@ def _state(report: core.StateReport) -> State:
         finished=counts.finished,
         dropped_at_the_door=counts.dropped_at_the_door,
         lost=counts.lost,
+        level=report.level,
     )

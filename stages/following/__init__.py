@@ -1,0 +1,1 @@
+"""Following: the pose of every camera frame, at once, from points of views that were rendered before."""

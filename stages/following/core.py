@@ -1,0 +1,189 @@
+"""The pose of a frame from points of views that exist, found again by their patches; the motion says nearly where.
+
+Points are chosen spread over the frame from the views that saw them most like the frame does; which of them are found
+tells how far the pose is to be trusted. Source: Klein and Murray, Parallel tracking and mapping for small AR workspaces
+(2007), whose patches are of camera frames where these are of the field, so that nothing drifts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from cachetools import LRUCache
+
+from fieldpose.stages.alignment.agreement import covariance_of, fit_agreeing
+from fieldpose.stages.alignment.constants import FOUND_PX
+from fieldpose.stages.alignment.images import FramePyramid
+from fieldpose.stages.alignment.landmarks import landmarks
+from fieldpose.stages.alignment.least_squares import CONVERGED, PoseFit
+from fieldpose.stages.alignment.placing import warped
+from fieldpose.stages.alignment.views import ViewPoints
+from fieldpose.stages.following.choice import Chosen, Found, chosen_points, is_found
+from fieldpose.stages.following.config import COARSE_POINTS, LEAST_FOUND, LEVELS, TOGETHER, FollowingConfig
+from fieldpose.stages.geometry import Camera, twist_covariance, viewing_angles
+from fieldpose.stages.geometry.arrays import Covariance, Depth, Flags, Grey, Pixels32, Transform
+
+_LOOSER = 1.4
+"""Errors before a round are larger than after the last by this and by how coarse the round is."""
+_APART_PX = 4.0
+"""Of a level: found points that are shifted otherwise than most by more are not used for the first fit."""
+_NEAR_ENOUGH = 1e-3
+_GOOD_START = 0.5
+"""Of the points: where so many are found from a start, no other is tried."""
+_BLURRED = 0.5
+"""Where a finer level finds fewer than this share of what the coarser one has, the frame is blurred."""
+_BY_TURN = 0.3
+"""What turning the camera on the spot counts, to turning it around what it sees."""
+_TYPICAL = 32
+"""So many points of a view tell from where it sees them."""
+
+
+@dataclass(frozen=True)
+class Followed:
+    """A frame's pose, and what it rests on.
+
+    covariance: (6, 6) of the left twist, as for a single image; noise: the part of it that each frame has anew.
+    pixels: (n, 2) of the frame, whose longer side was so long, where points were looked for, at the pose; found: (n,)
+    which of them were found.
+    level: how coarse the images were, 0 for not at all.  angle: typical one, in radians, between the directions from
+    which the points are seen in their views and in the frame.
+    """
+
+    cam_from_object: Transform
+    covariance: Covariance
+    noise: Covariance
+    longer_side: int
+    pixels: Pixels32
+    found: Flags
+    residual_px: float
+    level: int
+    angle: float
+
+
+class Follower:
+    """Remembers views and finds their points in frames; all views have the size of the first."""
+
+    def __init__(self, config: FollowingConfig) -> None:
+        self._config = config
+        self._views: LRUCache[str, ViewPoints] = LRUCache(config.views)
+
+    def __contains__(self, view_id: str) -> bool:
+        return view_id in self._views
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    @property
+    def longer_side(self) -> int:
+        """Of the views, in pixels; there must be one."""
+        view = next(iter(self._views.values()))
+        return max(view.camera.width, view.camera.height)
+
+    def add(self, view_id: str, grey: Grey, depth: Depth, camera: Camera, cam_from_object: Transform) -> None:
+        """Remember a view's points with the most texture; one that is known comes to mind again."""
+        if view_id in self._views:
+            _ = self._views[view_id]
+            return
+        points = landmarks(grey, depth, camera, cam_from_object, self._config.landmarks)
+        if len(points) >= LEAST_FOUND:
+            self._views[view_id] = ViewPoints.of(grey, depth, camera, cam_from_object, points, LEVELS)
+
+    def angle(self, cam_from_object: Transform) -> float:
+        """How differently, in radians, the nearest view has seen what a camera there sees; infinite without any."""
+        return min((difference(view, cam_from_object) for view in self._views.values()), default=np.inf)
+
+    def follow(self, frame: FramePyramid, starts: Sequence[Transform], points: int) -> Followed | None:
+        """The frame's pose near one of the poses to start from, the most likely first; None where too few are found.
+
+        points: how many are looked for at most.
+        """
+        best: tuple[PoseFit, Chosen] | None = None
+        for start in starts:
+            chosen = self._chosen(frame, start, points)
+            fit = _first_fit(chosen, frame, start)
+            if fit is None:
+                continue
+            if best is None or len(fit.pixels) > len(best[0].pixels):
+                best = fit, chosen
+            if len(fit.pixels) >= _GOOD_START * min(COARSE_POINTS, len(chosen)):
+                break
+        return None if best is None else _followed(best[1], frame, best[0])
+
+    def _chosen(self, frame: FramePyramid, pose: Transform, points: int) -> Chosen:
+        nearest = sorted(self._views.values(), key=lambda view: difference(view, pose))[:TOGETHER]
+        return chosen_points([(view, warped(view, frame, pose)) for view in nearest], frame, points)
+
+
+def difference(view: ViewPoints, cam_from_object: Transform) -> float:
+    """How differently a camera there sees the view's points: the angle between the directions, in radians, and more.
+
+    Seeing them e times as large counts as much as a radian.
+    """
+    some = view.points[:: max(1, len(view.points) // _TYPICAL)]
+    angle = float(np.median(viewing_angles(some, view.cam_from_object, cam_from_object)))
+    there = float(np.median(some @ view.cam_from_object[2, :3])) + view.cam_from_object[2, 3]
+    here = float(np.median(some @ cam_from_object[2, :3])) + cam_from_object[2, 3]
+    turned = float(np.arccos(np.clip(view.cam_from_object[2, :3] @ cam_from_object[2, :3], -1, 1)))
+    return angle + _BY_TURN * turned + (abs(np.log(here / there)) if here > 0 and there > 0 else np.pi)
+
+
+def _first_fit(chosen: Chosen, frame: FramePyramid, pose: Transform) -> PoseFit | None:
+    """The pose at the coarsest level, where most points are shifted alike however far the pose is off."""
+    level = LEVELS - 1
+    found = chosen.found(frame, pose, level, COARSE_POINTS)
+    if len(found) < LEAST_FOUND:
+        return None
+    shift = found.pixels - found.expected
+    alike = np.linalg.norm(shift - np.median(shift, axis=0), axis=1) < _APART_PX * 2**level
+    camera = frame.camera.undistorted()
+    fit, _ = fit_agreeing(
+        found.undistorted[alike], found.points[alike], camera, pose, found.weights[alike], np.inf, LEAST_FOUND,
+        _NEAR_ENOUGH,
+    )  # fmt: skip
+    return None if fit is None else _refitted(found, frame, fit.cam_from_object, level)[0]
+
+
+def _refitted(found: Found, frame: FramePyramid, pose: Transform, level: int) -> tuple[PoseFit | None, Flags]:
+    spread = _LOOSER * FOUND_PX * 2**level if level else FOUND_PX
+    return fit_agreeing(
+        found.undistorted, found.points, frame.camera.undistorted(), pose, found.weights, spread, LEAST_FOUND,
+        _NEAR_ENOUGH if level else CONVERGED,
+    )  # fmt: skip
+
+
+def _followed(chosen: Chosen, frame: FramePyramid, coarse: PoseFit) -> Followed | None:
+    """From level to level, until the frame, which may be blurred, shows no more."""
+    last: tuple[PoseFit, Found, Flags, int] | None = None
+    pose = coarse.cam_from_object
+    for level in range(LEVELS - 2, -1, -1):
+        found = chosen.found(frame, pose, level, COARSE_POINTS * 3 // 2 if level else None)
+        fit, agreeing = _refitted(found, frame, pose, level)
+        if fit is None or (last is not None and len(fit.pixels) < _BLURRED * len(last[0].pixels)):
+            break
+        last, pose = (fit, found, agreeing, level), fit.cam_from_object
+    return None if last is None else _described(chosen, frame, *last)
+
+
+def _described(
+    chosen: Chosen, frame: FramePyramid, fit: PoseFit, found: Found, agreeing: Flags, level: int
+) -> Followed:  # fmt: skip
+    pose, longer_side = fit.cam_from_object, max(frame.camera.width, frame.camera.height)
+    pixels, points = chosen.in_frame(frame, pose)
+    angle, fitted = chosen.angle(pose), found.pixels[agreeing]
+    noise = twist_covariance(fit.errors[1], fit.weights, fitted, longer_side, fit.variance, 0.0)
+    rms = float(np.sqrt((fit.errors[0] ** 2).sum(axis=1).mean()))
+    return Followed(
+        pose, covariance_of(fit, fitted, longer_side, angle), noise, longer_side, pixels.astype(np.float32),
+        is_found(found, points, agreeing), rms, level, angle,
+    )  # fmt: skip
+
+
+def warm_up() -> None:
+    """Follow a made-up frame, so that kernels are compiled (or fetched from the cache) before the first."""
+    camera = Camera(64, 64, 64.0, 64.0, 31.5, 31.5)
+    grey, depth = np.random.default_rng(0).integers(0, 256, (64, 64), np.uint8), np.full((64, 64), 2.5, np.float32)
+    follower = Follower(FollowingConfig())
+    follower.add("", grey, depth, camera, np.eye(4))
+    follower.follow(FramePyramid.of(grey, camera, 64, LEVELS), [np.eye(4)], 100)

@@ -1,0 +1,209 @@
+"""Videos whose every frame is followed, while solving goes on beside it on some of them.
+
+Following gives each frame its pose at once. Solves (render, match, lift, PnP) are asked for where no view has seen what
+the camera will see soon, where little is found, and now and then for certainty; what one finds late is carried on to
+the newest frame, and so never pulls the pose back.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from cachetools import FIFOCache
+
+from fieldpose.bus.messages import GuessReason, Reason
+from fieldpose.stages.alignment.images import FramePyramid
+from fieldpose.stages.following.config import POINTS_BY_LEVEL, FollowingConfig
+from fieldpose.stages.following.core import Followed, Follower
+from fieldpose.stages.nerf.training_views import TrainingViews
+from fieldpose.stages.tracking.config import TrackingConfig
+from fieldpose.stages.tracking.motion import NS_PER_MS
+from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, PoseResult, Step
+from fieldpose.stages.tracking.priors import Priors
+from fieldpose.stages.tracking.video import VideoPolicy
+
+_KEPT_FRAMES = 64
+_HOPS = 6
+"""So many frames, at most, are followed to carry a late pose on to the newest."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A frame and its grey values."""
+
+    frame: FrameInfo
+    image: FramePyramid
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What following has made of a frame, and how good that is."""
+
+    followed: Followed
+    quality: float
+
+
+class FollowedPolicy(VideoPolicy):
+    """A VideoPolicy for the frames that are solved, and the pose of every frame besides.
+
+    ahead_ms: how long it takes until a view that is asked for is there; level: how much less than it might following
+    does.
+    """
+
+    def __init__(
+        self, config: TrackingConfig, following: FollowingConfig, views: TrainingViews, priors: Priors,
+        start: np.ndarray | None = None, looks: bool = True,
+    ) -> None:  # fmt: skip
+        patient = replace(config, lost_after=following.lost_after, weak_after=following.weak_after)
+        super().__init__(patient, views, priors, start, looks)
+        self.follower = Follower(following)
+        self.ahead_ms = 0.0
+        self.level = 0
+        self._follows = following
+        self._same = following.same.scaled(views.scale)
+        self._kept: deque[Seen] = deque(maxlen=_KEPT_FRAMES)
+        self._measured: FIFOCache[int, Measured] = FIFOCache(_KEPT_FRAMES)
+        self._asked_ns: int | None = None
+
+    def follow(self, frame: FrameInfo, image: FramePyramid | None) -> tuple[Belief, Followed | None]:
+        """What is believed of a new frame, and what was measured of it; image: None for a frame that is unreadable."""
+        if image is None:
+            return self._not_followed(frame, Reason.FRAME_UNREADABLE), None
+        self._kept.append(Seen(frame, image))
+        measured = self._measure(self._kept[-1], self._starts(frame))
+        if measured is None:
+            return self._not_followed(frame, Reason.NO_CONSENSUS), None
+        tracked = self._on_track(frame)
+        least = self._config.score.usable if tracked else self._follows.found_again
+        if measured.quality < least or (tracked and not self._in_reach(frame, measured.followed)):
+            return self._not_followed(frame, Reason.IMPLAUSIBLE_POSE), measured.followed
+        return self._believe(frame, measured), measured.followed
+
+    def first_step(self, frame: FrameInfo) -> Step | None:
+        """What to do for a frame that might be solved; None where none need be now."""
+        measured = self._measured.get(frame.capture_ns)
+        if not self._trust.tracked or measured is None or measured.quality < self._config.score.good:
+            self._asked_ns = frame.capture_ns
+            return super().first_step(frame)
+        ahead = self._motion.predict(frame.capture_ns + int(self.ahead_ms * NS_PER_MS))
+        if not self._due(frame.capture_ns) and self.follower.angle(ahead) < np.deg2rad(self._follows.fresh_deg):
+            return None
+        self._asked_ns = frame.capture_ns
+        return self._guess(GuessReason.MOTION, ahead)
+
+    def next_step(self, attempt: Attempt, result: PoseResult) -> Step | None:
+        """Following makes a good pose exact, so that no further pass is needed for that."""
+        guess, pose = attempt.guess, self._usable(result)
+        if self._trust.tracked and attempt.frame.capture_ns in self._measured:
+            return None
+        good = self._quality(result) >= self._config.score.good
+        if good and guess is not None and pose is not None and self._far.holds(guess.cam_from_object, pose):
+            return None
+        return super().next_step(attempt, result)
+
+    def conclude(self, attempt: Attempt, result: PoseResult) -> Belief:
+        """A solve bears out what was followed, or speaks against it: one that is better, or two that agree, replace it.
+
+        Where nothing was followed, its pose is believed as a VideoPolicy would, and carried on to the newest frame.
+        """
+        pose, capture_ns = self._usable(result), attempt.frame.capture_ns
+        measured = self._measured.get(capture_ns) if self._trust.tracked else None
+        if measured is not None and not self._speaks_against(measured, capture_ns, pose, result):
+            return Belief(self._trust.state, measured.quality, measured.followed.cam_from_object)
+        if measured is not None:
+            self._trust.lost()
+        belief = super().conclude(attempt, result)
+        if belief.score > 0 and belief.cam_from_object is not None:
+            self._carry_on(capture_ns, belief.cam_from_object)
+        return belief
+
+    def missed(self, frame: FrameInfo, reason: Reason) -> Belief:
+        """A solve that was lost on its way says nothing of what was followed."""
+        self._asked_ns = None
+        return self._without_pose(frame, reason)
+
+    def _on_track(self, frame: FrameInfo) -> bool:
+        return self._trust.tracked and self._motion.within_horizon(frame.capture_ns)
+
+    def _starts(self, frame: FrameInfo) -> Sequence[np.ndarray]:
+        """Where to look, the most likely first: where a prior says, where the motion leads, where the camera was."""
+        if len(self._motion) == 0:
+            return []
+        moved = [self._motion.predict(frame.capture_ns)] if self._on_track(frame) else []
+        prior = self._priors.peek(frame.frame_id)
+        return [*([] if prior is None else [prior]), *moved, self._motion.newest]
+
+    def _measure(self, seen: Seen, starts: Sequence[np.ndarray]) -> Measured | None:
+        if not starts or len(self.follower) == 0:
+            return None
+        followed = self.follower.follow(seen.image, starts, POINTS_BY_LEVEL[self.level])
+        if followed is None:
+            return None
+        found = int(followed.found.sum())
+        result = PoseResult(
+            seen.frame.frame_id, 0, followed.cam_from_object, followed.covariance, found, len(followed.found),
+            followed.residual_px,
+        )  # fmt: skip
+        return Measured(followed, self._quality(result))
+
+    def _in_reach(self, frame: FrameInfo, followed: Followed) -> bool:
+        reach = self._reach(frame.capture_ns - self._motion.newest_ns)
+        return reach.holds(self._motion.predict(frame.capture_ns), followed.cam_from_object)
+
+    def _believe(self, frame: FrameInfo, measured: Measured) -> Belief:
+        if not self._trust.tracked:
+            self._motion.reset()
+        pose = measured.followed.cam_from_object
+        self._motion.add(frame.capture_ns, pose)
+        self._measured[frame.capture_ns] = measured
+        if measured.quality >= self._config.score.good:
+            self._trust.good()
+            self._keyframes.add(pose)
+        else:
+            self._trust.weak()
+        covariance = self._certainty.of(measured.followed.covariance, pose, pose)
+        return Belief(self._trust.state, measured.quality, pose, covariance)
+
+    def _not_followed(self, frame: FrameInfo, reason: Reason) -> Belief:
+        was_tracked = self._trust.tracked
+        if was_tracked:
+            self._trust.rejected()
+            self._prepare_relocalisation(was_tracked)
+        return self._without_pose(frame, reason)
+
+    def _due(self, capture_ns: int) -> bool:
+        return self._asked_ns is None or abs(capture_ns - self._asked_ns) > self._follows.solve_ms * NS_PER_MS
+
+    def _speaks_against(self, measured: Measured, capture_ns: int, pose: np.ndarray | None, result: PoseResult) -> bool:
+        """Whether a solve's pose is to replace what was followed."""
+        if pose is None or self._same.holds(measured.followed.cam_from_object, pose):
+            self._unconfirmed = None
+            return False
+        good = self._config.score.good
+        if self._quality(result) < good:
+            return False
+        if measured.quality < good or self._confirms(capture_ns, pose):
+            return True
+        self._unconfirmed = (capture_ns, pose)
+        self._asked_ns = None
+        return False
+
+    def _carry_on(self, capture_ns: int, pose: np.ndarray) -> None:
+        """Follow from a pose of before to the newest frame, at once where that leads there, else by way of others."""
+        later = [seen for seen in self._kept if seen.frame.capture_ns > capture_ns]
+        at, target = -1, len(later) - 1
+        for _ in range(_HOPS):
+            if target <= at:
+                return
+            seen = later[target]
+            measured = self._measure(seen, [self._motion.predict(seen.frame.capture_ns), pose])
+            if measured is None or measured.quality < self._config.score.usable:
+                target = (at + target) // 2
+                continue
+            pose = measured.followed.cam_from_object
+            self._motion.add(seen.frame.capture_ns, pose)
+            self._measured[seen.frame.capture_ns] = measured
+            at, target = target, len(later) - 1

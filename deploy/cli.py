@@ -26,6 +26,7 @@ COMMANDS = {
     "record": "record a pipeline that is running",
     "replay": "run the pipeline again on a recording's frames and compare the poses",
     "info": "what a recording holds, topic by topic, and what it lacks",
+    "edit": "a recorded sequence with a disturbance in it, to test how far tracking can be trusted",
     "recover": "save what can be saved of an unfinished or damaged recording",
     "evaluate": "how well poses are found on a dataset, method by method",
     "bench": "how fast the parts are on this machine",

@@ -16,7 +16,7 @@ from fieldpose.bus.messages import CameraInfo
 from fieldpose.bus.replay import RECORDING_RECORD, RecordingInfo, info, read_recording
 from fieldpose.bus.topics import CAMERA_INFO
 from fieldpose.deploy.reporting.output import result_console, write_json
-from fieldpose.deploy.reporting.provenance import PLAN_RECORD, RUN_RECORD
+from fieldpose.deploy.reporting.provenance import EDIT_RECORD, PLAN_RECORD, RUN_RECORD
 from fieldpose.deploy.reporting.report import CAMERA_ORIGINS
 
 
@@ -62,6 +62,7 @@ def _description(recording: RecordingInfo, cameras: Mapping[str, int]) -> Iterat
     yield from (f"  {name}: {value}" for name, value in run.items())
     yield from (f"  camera {CAMERA_ORIGINS[origin]}: {count} frames" for origin, count in cameras.items())
     yield from (f"  planned: {name}: {value}" for name, value in recording.metadata.get(PLAN_RECORD, {}).items())
+    yield from (f"  edited: {name}: {value}" for name, value in recording.metadata.get(EDIT_RECORD, {}).items())
     yield from (f"  attached: {name} ({count} bytes)" for name, count in recording.attachments.items())
 
 

@@ -16,7 +16,7 @@ from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.settings import Settings, changed, to_json, without_unknown
 from fieldpose.errors import RecordingError
 
-RUN_RECORD, PLAN_RECORD = "fieldpose.run", "fieldpose.plan"
+RUN_RECORD, PLAN_RECORD, EDIT_RECORD = "fieldpose.run", "fieldpose.plan", "fieldpose.edit"
 SETTINGS_ATTACHMENT = "settings.json"
 FIELD_ATTACHMENT = "field.safetensors"
 _PACKAGES = ("fieldpose", "numpy", "torch", "kornia", "numba", "opencv-python-headless", "eclipse-zenoh")

@@ -10,7 +10,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import psutil
@@ -63,6 +63,14 @@ class Handler(Protocol):
 
     def stop(self) -> None:
         """Let go of what `start` took; called also when `start` was interrupted."""
+
+
+@runtime_checkable
+class KeepsTime(Protocol):
+    """A handler whose next tick is not to wait for the usual 20 ms."""
+
+    def tick_in_s(self, now_ns: int) -> float:
+        """How long until `tick` is to be called, at most."""
 
 
 class JoinedHandler:
@@ -207,9 +215,14 @@ class _Node:
             self._run(lambda: self._handler.handle(received.topic, received.message))
         if time.monotonic() >= self._next_tick:
             self._run(lambda: self._handler.tick(time.time_ns()))
-            self._next_tick = time.monotonic() + TICK_S
+            self._next_tick = time.monotonic() + self._tick_in_s()
         if time.monotonic() >= self._next_stats:
             self._send_stats(ready=True)
+
+    def _tick_in_s(self) -> float:
+        if not isinstance(self._handler, KeepsTime):
+            return TICK_S
+        return min(TICK_S, self._handler.tick_in_s(time.time_ns()))
 
     def _run(self, work: Callable[[], Iterable[Output]]) -> None:
         """Publish what `work` answers; a call that answers nothing was no work and is not timed."""

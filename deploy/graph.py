@@ -68,8 +68,9 @@ class Process:
     """A row of the graph.
 
     reads: all that its handler may join or listen to; one with less to do reads less. needs_field: it cannot start
-    without. renders: it runs the field's kernels. parallel: its work can use several threads. stop_s: how long it may
-    take to end. wanted: whether a plan has work for it.
+    without. renders: it runs the field's kernels. parallel: its work can use several threads. solves: where every frame
+    is followed, its work is beside that and gives way to it. stop_s: how long it may take to end. wanted: whether a
+    plan has work for it.
     """
 
     name: str
@@ -79,6 +80,7 @@ class Process:
     needs_field: bool = False
     renders: bool = False
     parallel: bool = False
+    solves: bool = False
     stop_s: float = 2.0
     wanted: Callable[[Plan], bool] = lambda plan: True
 
@@ -136,7 +138,7 @@ def _rendering(parts: Parts, launch: Launch) -> Handler:
 def _matching(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.matching.node import MatchingNode
 
-    return MatchingNode(lambda: parts.pairs, parts.images)
+    return MatchingNode(lambda: parts.pairs, parts.images, parts.settings.rendering.longer_side)
 
 
 def _lifting(parts: Parts, launch: Launch) -> Handler:
@@ -173,21 +175,22 @@ GRAPH: tuple[Process, ...] = (
         writes=(SEARCH, GUESS, FOLLOWED, STATE), needs_field=True,
     ),
     Process(
-        "retrieval", _retrieval, reads=(SEARCH, FRAME), writes=(RETRIEVED, FAILURE), needs_field=True,
+        "retrieval", _retrieval, reads=(SEARCH, FRAME), writes=(RETRIEVED, FAILURE), needs_field=True, solves=True,
         wanted=lambda plan: plan.looks,
     ),
     Process(
-        "rendering", _rendering, reads=(GUESS,), writes=(VIEW, FAILURE), needs_field=True, renders=True, parallel=True
+        "rendering", _rendering, reads=(GUESS,), writes=(VIEW, FAILURE), needs_field=True, renders=True, parallel=True,
+        solves=True,
     ),
-    Process("matching", _matching, reads=(VIEW, FRAME), writes=(MATCHES, FAILURE), parallel=True),
+    Process("matching", _matching, reads=(VIEW, FRAME), writes=(MATCHES, FAILURE), parallel=True, solves=True),
     Process(
         "lifting", _lifting, reads=(MATCHES, VIEW), writes=(CORRESPONDENCES, FAILURE), needs_field=True, renders=True,
-        parallel=True,
+        parallel=True, solves=True,
     ),
-    Process("pnp", _pnp, reads=(CORRESPONDENCES, VIEW, FRAME), writes=(ESTIMATE, FAILURE)),
+    Process("pnp", _pnp, reads=(CORRESPONDENCES, VIEW, FRAME), writes=(ESTIMATE, FAILURE), solves=True),
     Process(
         "refinement", _refinement, reads=(ESTIMATE, FRAME), writes=(POSE, FAILURE), needs_field=True, renders=True,
-        parallel=True,
+        parallel=True, solves=True,
     ),
 )  # fmt: skip
 BY_NAME: dict[str, Process] = {row.name: row for row in GRAPH}

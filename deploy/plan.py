@@ -29,8 +29,8 @@ Sequence = Literal["video", "photos"]
 class Plan:
     """A pipeline to be run: its field, and settings with nothing left open but the pace of a source that is elsewhere.
 
-    looks: whether retrieval can be asked. follows: whether every frame is followed. notes: what was decided, and why, by
-    name.
+    looks: whether retrieval can be asked. follows: whether every frame is followed. notes: what was decided, and why,
+    by name.
     """
 
     settings: Settings

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 
 _START_S = 300.0
 """Others may be compiling their kernels."""
+_GIVES_WAY = 10
+"""How nice a process is whose work must not be in the way of following: for ten times less of a core both want."""
 
 
 _Name = Annotated[str, tyro.conf.arg(constructor=tyro.extras.literal_type_from_choices(list(BY_NAME)))]
@@ -107,6 +109,8 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     # In whatever order they are started, the first frame finds all that work on it.
     passed = tuple(other.name for other in rows_of(plan, recorded=False) if other.name in AT_WORK)
     awaited = options.wait_for if options.wait_for is not None else passed if row.name == CAMERA else ()
+    if plan.follows and row.solves:
+        os.nice(_GIVES_WAY)
     bus = ZenohBus(options.connect, options.listen or peer_address(options.connect))
     _tell(plan, row)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.messages import Message
-from fieldpose.bus.node import EndOfInput, Output
+from fieldpose.bus.node import TICK_S, EndOfInput, Output
 from fieldpose.bus.topics import CAMERA_INFO, FAILURE, FRAME, POSE, STATE, TRUTH, Topic
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.sender import Sender
@@ -44,6 +44,10 @@ class CameraNode:
         now_ns = time.time_ns()
         self._opened.heard(message, now_ns)
         return self.tick(now_ns)  # or an answer would wait up to 20 ms for the next frame
+
+    def tick_in_s(self, now_ns: int) -> float:
+        """A frame goes out when it is due, not at the next beat after that."""
+        return self._opened.wait_s(now_ns) or TICK_S
 
     def tick(self, now_ns: int) -> Iterator[Output]:
         yield from self._opened.messages(now_ns)

@@ -16,7 +16,7 @@ class FollowingConfig:
     when: Literal["auto", "always", "never"] = "auto"
     """auto: in videos whose frames come at their own times; without it a frame has a pose once it has passed all
     stages"""
-    landmarks: int = 250
+    landmarks: int = 450
     """points of a view that are kept for it, those with the most texture"""
     views: int = 24
     """views that are remembered"""
@@ -53,5 +53,5 @@ COARSE_POINTS = 80
 """Looked for at the coarsest level; half as many again at each finer one but the last."""
 LEAST_FOUND = 8
 """Fewer points are no pose."""
-POINTS_BY_LEVEL = (200, 140, 100, 70)
+POINTS_BY_LEVEL = (400, 280, 190, 120, 70)
 """How many points are looked for in a frame, from the level at which time is plenty to that where it is shortest."""

@@ -22,7 +22,7 @@ from fieldpose.stages.alignment.placing import warped
 from fieldpose.stages.alignment.views import ViewPoints
 from fieldpose.stages.following.choice import Chosen, Found, chosen_points, is_found
 from fieldpose.stages.following.config import COARSE_POINTS, LEAST_FOUND, LEVELS, TOGETHER, FollowingConfig
-from fieldpose.stages.geometry import Camera, twist_covariance, viewing_angles
+from fieldpose.stages.geometry import Camera, exp_se3, log_se3, twist_covariance, viewing_angles
 from fieldpose.stages.geometry.arrays import Covariance, Depth, Flags, Grey, Pixels32, Transform
 
 _LOOSER = 1.4
@@ -181,7 +181,11 @@ def _described(
 
 
 def warm_up() -> None:
-    """Follow a made-up frame, so that kernels are compiled (or fetched from the cache) before the first."""
+    """Follow a made-up frame, so that kernels are compiled (or fetched from the cache) before the first.
+
+    And have scipy imported, of which the motion between poses is made.
+    """
+    exp_se3(log_se3(np.eye(4)))
     camera = Camera(64, 64, 64.0, 64.0, 31.5, 31.5)
     grey, depth = np.random.default_rng(0).integers(0, 256, (64, 64), np.uint8), np.full((64, 64), 2.5, np.float32)
     follower = Follower(FollowingConfig())

@@ -12,7 +12,7 @@ from fieldpose.bus.topics import FRAME, MATCHES, VIEW
 from fieldpose.stages.matching.core import PairMatcher
 from fieldpose.stages.wire import FrameImages
 
-_WARM_UP_PX = 400
+_USUAL_ASPECT = 3 / 4
 
 
 class MatchingNode(JoinedHandler):
@@ -22,16 +22,17 @@ class MatchingNode(JoinedHandler):
     inputs = (VIEW, FRAME)
     output = MATCHES
 
-    def __init__(self, make_pairs: Callable[[], PairMatcher], images: FrameImages) -> None:
+    def __init__(self, make_pairs: Callable[[], PairMatcher], images: FrameImages, view_size: int) -> None:
         super().__init__()
-        self._make_pairs, self._images = make_pairs, images
+        self._make_pairs, self._images, self._view_size = make_pairs, images, view_size
 
     def start(self) -> None:
         self._pairs = self._make_pairs()
-        noise = np.random.default_rng(0).integers(0, 256, (_WARM_UP_PX, _WARM_UP_PX, 3), np.uint8)
+        shape = (round(_USUAL_ASPECT * self._view_size), self._view_size, 3)
+        noise = np.random.default_rng(0).integers(0, 256, shape, np.uint8)
         solid = np.ones(noise.shape[:2], np.float32)
-        # The first inferences are slow, for networks choose their kernels in them: for two images, and for one, which
-        # a frame is whose view comes again.
+        # The first inferences are slow, for networks choose their kernels in them, for each shape: for two images, and
+        # for one, which a frame is whose view comes again.
         for frame_key in ("warm-up", "again"):
             self._pairs.match(noise, solid, noise, "warm-up", frame_key)
 

@@ -95,12 +95,11 @@ class FollowedPolicy(VideoPolicy):
         return self._guess(GuessReason.MOTION, ahead)
 
     def next_step(self, attempt: Attempt, result: PoseResult) -> Step | None:
-        """Following makes a good pose exact, so that no further pass is needed for that."""
-        guess, pose = attempt.guess, self._usable(result)
+        """Following makes a pose exact and tells whether it is right, so that no further pass is needed for that."""
         if self._trust.tracked and attempt.frame.capture_ns in self._measured:
             return None
-        good = self._quality(result) >= self._config.score.good
-        if good and guess is not None and pose is not None and self._far.holds(guess.cam_from_object, pose):
+        pose = self._usable(result)
+        if pose is not None and self._bears_out(attempt.frame, pose):
             return None
         return super().next_step(attempt, result)
 
@@ -115,7 +114,10 @@ class FollowedPolicy(VideoPolicy):
             return Belief(self._trust.state, measured.quality, measured.followed.cam_from_object)
         if measured is not None:
             self._trust.lost()
-        belief = super().conclude(attempt, result)
+        elif self._followed_since(capture_ns):
+            return Belief(self._trust.state, 0.0)
+        begun = self._bears_out(attempt.frame, pose) if pose is not None and not self._trust.tracked else None
+        belief = super().conclude(attempt, result) if begun is None else self._believe(attempt.frame, begun)
         if belief.score > 0 and belief.cam_from_object is not None:
             self._carry_on(capture_ns, belief.cam_from_object)
         return belief
@@ -124,6 +126,20 @@ class FollowedPolicy(VideoPolicy):
         """A solve that was lost on its way says nothing of what was followed."""
         self._asked_ns = None
         return self._without_pose(frame, reason)
+
+    def _bears_out(self, frame: FrameInfo, pose: np.ndarray) -> Measured | None:
+        """What following finds of a frame at a solve's pose, if it is good and near that."""
+        seen = next((seen for seen in self._kept if seen.frame.capture_ns == frame.capture_ns), None)
+        measured = None if seen is None else self._measure(seen, [pose])
+        if measured is None or measured.quality < self._config.score.good:
+            return None
+        return measured if self._far.holds(measured.followed.cam_from_object, pose) else None
+
+    def _followed_since(self, capture_ns: int) -> bool:
+        """Whether what could not be followed then was found again without the solve."""
+        newest = self._measured.get(self._motion.newest_ns) if self._trust.tracked else None
+        good = newest is not None and newest.quality >= self._config.score.good
+        return good and self._motion.newest_ns > capture_ns
 
     def _on_track(self, frame: FrameInfo) -> bool:
         return self._trust.tracked and self._motion.within_horizon(frame.capture_ns)

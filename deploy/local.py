@@ -57,7 +57,7 @@ class LocalPipeline:
 
     def send(self, *outputs: Output) -> Iterator[Said]:
         """Hand these messages on, and give all that is said because of them, until nothing more is."""
-        waiting = deque(Said(topic, _stamped(message, ""), "", 0.0) for topic, message in outputs)
+        waiting = deque(Said(topic, stamped(message, ""), "", 0.0) for topic, message in outputs)
         while waiting:
             said = waiting.popleft()
             yield said
@@ -173,7 +173,7 @@ def photo_finder(settings: Settings, views: TrainingViews, renderer: RayRenderer
     return PoseFinder(Parts(resolve(photos, views), renderer=renderer, views=views, together=True))
 
 
-def _stamped(message: Message, source: str) -> Message:
+def stamped(message: Message, source: str) -> Message:
     """With the sender and the time of sending in its header, as a message on the bus has them."""
     stamped = copy.copy(message)
     stamped.header = msgspec.structs.replace(message.header, source=source, sent_ns=time.time_ns())
@@ -183,7 +183,7 @@ def _stamped(message: Message, source: str) -> Message:
 def _timed(sender: str, outputs: Iterable[Output]) -> Iterator[Said]:
     began = time.perf_counter()
     for topic, message in outputs:
-        yield Said(topic, _stamped(message, sender), sender, (time.perf_counter() - began) * 1e3)
+        yield Said(topic, stamped(message, sender), sender, (time.perf_counter() - began) * 1e3)
         began = time.perf_counter()
 
 

@@ -44,7 +44,8 @@ _ANY_FRAME = Frame(
 class TrackingNode:
     """A Handler around the tracker that `make_tracker` gives at start.
 
-    follows: every frame is followed, so that frames and views are read with their pixels; `see` makes a frame ready.
+    see: makes a frame ready to be followed; with it, frames and views are read with their pixels. clock: the time in
+    nanoseconds since the epoch.
     """
 
     name = "tracking"
@@ -56,6 +57,7 @@ class TrackingNode:
         seen = (CAMERA_INFO,) if see is None else (FRAME, VIEW)
         self.inputs: tuple[Topic[Any], ...] = (*seen, PRIOR, RETRIEVED, POSE, FAILURE)
         self._make_tracker, self._see = make_tracker, see
+        self.clock = time.time_ns
         self._sequences = Sequences()
         self._throttle = Throttle(stage_logger(self.name))
 
@@ -66,7 +68,7 @@ class TrackingNode:
             self._see(_ANY_FRAME)
 
     def handle(self, topic: Topic[Any], message: Message) -> Iterable[Output]:
-        return outputs_of(self._take_in(message, time.time_ns()))
+        return outputs_of(self._take_in(message, self.clock()))
 
     def tick(self, now_ns: int) -> Iterable[Output]:
         return outputs_of(self._tracker.on_tick(now_ns))
@@ -104,8 +106,8 @@ class TrackingNode:
     def _follow(
         self, tracker: FollowingTracker, frame: Frame, see: See, now_ns: int
     ) -> Sequence[core.Output | FollowedReport]:
-        began = time.perf_counter()
+        began_ns = self.clock()
         missed = self._sequences.seen(FRAME.name, frame.header)
         outputs = tracker.on_frame(frame_info(frame), see(frame), now_ns, missed)
-        tracker.took((time.perf_counter() - began) * 1e3)
+        tracker.took((self.clock() - began_ns) * 1e-6)
         return outputs

@@ -73,6 +73,7 @@ def resolve(settings: Settings, views: TrainingViews | None, field: Path | None 
         settings,
         backend=backend,
         camera=camera,
+        following=replace(settings.following, when="always" if follows else "never"),
         tracking=replace(settings.tracking, sequence=sequence, guess=absolute(settings.tracking.guess)),
         rendering=_rendering(settings.rendering, sequence, sequence == "photos" or begins.by_frame, follows, notes),
         matching=replace(settings.matching, device=_device(settings.matching.device, backend)),

@@ -28,7 +28,7 @@ PAYLOADS = {topic: encode(message) for topic, message in SAMPLES.items()}
 LATER = {
     topics.FRAME: {"camera_origin"},
     topics.CAMERA_INFO: {"camera_origin"},
-    topics.STATE: {"reason", "camera_origin"},
+    topics.STATE: {"reason", "camera_origin", "level"},
     topics.STATS: {"busy_s"},
 }
 FREE_TEXT = ("view_id", "stage")

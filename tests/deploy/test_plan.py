@@ -30,9 +30,26 @@ def test_videos_get_small_views_used_again_and_no_refinement(source: str) -> Non
     plan = resolve(from_source(source), KNOWN)
     chosen = plan.settings
     assert (chosen.tracking.sequence, chosen.rendering.size, chosen.refinement.when) == ("video", 256, "never")
-    assert chosen.rendering.reuse_angle_deg == 5.0
+    assert plan.follows
+    assert (chosen.rendering.reuse_angle_deg, plan.in_flight) == (0.0, 1)
     assert not plan.independent
     assert chosen.camera.pace == ("live" if source else "auto")
+
+
+def test_videos_that_are_not_followed_get_views_used_again() -> None:
+    for changes in ({"following": {"when": "never"}}, {"camera": {"source": "mcap:a.mcap", "pace": "lockstep"}}):
+        plan = resolve(changed(from_source("mcap:a.mcap"), changes, "test"), KNOWN)
+        assert not plan.follows
+        assert plan.settings.rendering.reuse_angle_deg == 5.0
+        assert plan.notes["following"].startswith("off")
+    forced = {"following": {"when": "always"}, "camera": {"source": "mcap:a.mcap", "pace": "lockstep"}}
+    assert resolve(changed(from_source("mcap:a.mcap"), forced, "test"), KNOWN).follows
+
+
+def test_frames_that_stand_by_themselves_cannot_be_followed() -> None:
+    for source, tracking in (("folder:a", {}), ("mcap:a.mcap", {"guess": "perturb:10-40deg,0.2"})):
+        with pytest.raises(ConfigError, match="not frames of a video"):
+            resolve(from_source(source, tracking=tracking, following={"when": "always"}), KNOWN)
 
 
 @pytest.mark.parametrize("source", ["folder:a", "dataset:a:test"])
@@ -64,10 +81,9 @@ def test_a_plan_read_back_is_the_same_plan(source: str, tmp_path: Any) -> None:
     again = resolve(read_settings(path), KNOWN)
     assert again.settings == first.settings
     assert again.begins == first.begins
-    assert (again.looks, again.independent) == (first.looks, first.independent)
-    assert "auto" not in to_json(first.settings).decode().replace('"holdout": "auto"', "").replace(
-        '"pace": "auto"' if not source else "-", ""
-    )
+    assert (again.looks, again.independent, again.follows) == (first.looks, first.independent, first.follows)
+    said = to_json(first.settings).decode().replace('"holdout": "auto"', "")
+    assert "auto" not in said.replace('"pace": "auto"' if not source else "-", "")
 
 
 def test_guesses_for_each_frame_make_frames_independent() -> None:
@@ -90,9 +106,10 @@ def test_retrieval_is_asked_where_the_field_remembers_its_views() -> None:
 
 def test_every_decision_is_told() -> None:
     notes = resolve(from_source("folder:a"), KNOWN).notes
-    told = {"sequence", "retrieval", "guess", "backend", "pace", "view size", "views used again", "refinement"}
+    told = {"sequence", "retrieval", "guess", "backend", "pace", "following", "refinement"}
+    told |= {"view size", "views used again"}
     assert set(notes) == told
-    assert all("auto" in notes[name] for name in told - {"retrieval", "guess"})
+    assert all("auto" in notes[name] for name in told - {"retrieval", "guess", "following"})
 
 
 def test_what_cannot_be_is_refused_before_anything_starts() -> None:

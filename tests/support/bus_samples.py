@@ -13,6 +13,7 @@ from fieldpose.bus.messages import (
     Correspondences,
     Estimate,
     Failure,
+    Followed,
     Frame,
     Guess,
     GuessReason,
@@ -135,6 +136,10 @@ def every_message() -> dict[Topic[Any], Message]:
             loss_after=1.0,
         ),
         topics.FAILURE: failure(3),
+        topics.FOLLOWED: Followed(
+            header=header, **pose, pixels_in_frame=np.zeros((2, 2), np.float32), found=np.array([True, False]),
+            residual_px=0.3, level=1,
+        ),
         topics.STATE: State(
             header=header,
             state=TrackingState.LIMITED,

@@ -24,7 +24,7 @@ STATE_COLOURS = {"initializing": "#9aa5b1", "tracking": "#4caf6d", "limited": "#
 _FOUND, _CARRIED, _MISSED = "#1f4e79", "#9467bd", "#c0392b"
 _WIDTH, _PANEL, _LOW, _STRIP, _AROUND = 11.0, 1.8, 0.9, 0.6, 1.35
 _LAST_S = 0.02
-_FEW_DECADES = 2.0
+_FEW = 100.0
 _DPI = 110
 
 Timed = Sequence[tuple[float, FrameResult]]
@@ -134,12 +134,19 @@ def _draw_panel(axis: Axes, panel: _Panel, timed: Timed) -> None:
     if panel.limits is not None:
         axis.set_ylim(*panel.limits)
     if panel.scale == "log":
-        few = np.log10(axis.get_ylim()) @ (-1, 1) < _FEW_DECADES
-        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,)))
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_formatter(NullFormatter())
+        _label_decades(axis)
     axis.set_ylabel(panel.label, fontsize=9)
     axis.grid(visible=True, alpha=0.35)
+
+
+def _label_decades(axis: Axes) -> None:
+    """Plain numbers, on an axis of at least one decade."""
+    low, high = axis.get_ylim()
+    around = max(1.0, (10 * low / high) ** 0.5)
+    axis.set_ylim(low / around, high * around)
+    axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < _FEW * low else (1,)))
+    axis.yaxis.set_major_formatter("{x:g}")
+    axis.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_legend(drawing: Figure) -> None:

@@ -18,7 +18,7 @@ help:
 	@echo "make demo      the embedded scene through the whole pipeline; writes out/demo"
 	@echo "make test      lint, types, architecture, tests"
 	@echo "make lint      only the first three"
-	@echo "make bench     how fast rendering, training, matching, bus and tracking are here; 40 minutes; out/bench"
+	@echo "make bench     how fast rendering, training, matching, bus and tracking are here; an hour; out/bench"
 
 install: $(INSTALLED)
 

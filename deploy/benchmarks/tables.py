@@ -134,47 +134,89 @@ def print_bus(figures: dict[str, Any]) -> None:
 
 
 def print_track(figures: dict[str, Any]) -> None:
-    """Rates, latencies and errors of each mode, and what each process takes."""
+    """How each sequence was followed, by cores and by ablation; the share that is right by steps; the processes."""
     console = result_console()
-    table = Table(title="the demo's camera, followed live at 30 frames a second", title_justify="left")
-    table.add_column("mode")
-    for mode in figures["modes"]:
-        table.add_column(mode, justify="right")
+    by_cores = _track_columns(figures["sequences"])
+    console.print(_track_table("followed live", by_cores))
+    steps = _steps(figures["sequences"])
+    if steps.columns:
+        console.print(steps)
+    for name, measured in figures["ablations"].items():
+        if measured is not figures["sequences"]:
+            console.print(_track_table(name, _track_columns(measured)))
+    console.print(_processes(by_cores))
+    rate = figures["plain_loop_rate_hz"]
+    console.print(f"{figures['machine']}; in one process, all work done: {rate:.1f} frames a second", highlight=False)
+
+
+def _track_columns(measured: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    return {
+        f"{name}, {cores} core{'' if cores == '1' else 's'}": figures
+        for name, sequence in measured.items()
+        for cores, figures in sequence["cores"].items()
+    }
+
+
+def _track_table(title: str, columns: dict[str, dict[str, Any]]) -> Table:
+    table = Table("", title=title, title_justify="left")
+    for name in columns:
+        table.add_column(name, justify="right")
     for what, told in _TRACK_ROWS.items():
-        table.add_row(what, *(told(mode) for mode in figures["modes"].values()))
-    console.print(table)
-    processes = Table(title="CPU s and memory MB of each process", title_justify="left")
-    processes.add_column("process")
-    for mode in figures["modes"]:
-        processes.add_column(mode, justify="right")
-    for name in dict.fromkeys(name for mode in figures["modes"].values() for name in mode["cpu_by_process"]):
-        processes.add_row(name, *(_of_process(mode, name) for mode in figures["modes"].values()))
-    console.print(processes)
-    console.print(figures["machine"], highlight=False)
+        table.add_row(what, *(told(figures) for figures in columns.values()))
+    return table
 
 
-def _of_process(mode: dict[str, Any], name: str) -> str:
-    if name not in mode["cpu_by_process"]:
-        return "-"
-    return f"{mode['cpu_by_process'][name]:.1f}  {mode['rss_mb_by_process'][name]:5.0f}"
+def _steps(measured: dict[str, Any]) -> Table:
+    """A row for each step; no columns where there are no steps."""
+    by_name = {
+        name: figures["steps"]
+        for name, sequence in measured.items()
+        for figures in sequence["cores"].values()
+        if figures.get("steps")
+    }
+    table = Table(title="right, of all frames sent", title_justify="left")
+    for name in ("every", *by_name) if by_name else ():
+        table.add_column(name, justify="right")
+    for step in dict.fromkeys(step for steps in by_name.values() for step in steps):
+        table.add_row(f"{step}. frame", *(_percent(steps[step]["share_right"]) for steps in by_name.values()))
+    return table
 
 
-def _errors(mode: dict[str, Any]) -> str:
-    turn, shift = mode["rotation_error_deg"], mode["translation_error"]
-    return "-" if turn is None or shift is None else f"{turn['median']:.3f} deg  {shift['median']:.4f}"
+def _processes(columns: dict[str, dict[str, Any]]) -> Table:
+    table = Table("process", title="CPU s and memory MB (shared parts once) of each process", title_justify="left")
+    for name in columns:
+        table.add_column(name, justify="right")
+    cpu_s, memory = "cpu_s_by_process", "pss_mb_by_process"
+    names = dict.fromkeys(name for figures in columns.values() for name in (*figures[memory], *figures[cpu_s]))
+    for name in names:
+        table.add_row(
+            name, *(f"{_number(f[cpu_s].get(name), 1)}  {_number(f[memory].get(name), 0):>5}" for f in columns.values())
+        )
+    return table
 
 
+_ERRORS = ("median", "p99", "max")
 _TRACK_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
-    "frames sent": lambda mode: f"{mode['frames_sent']}",
-    "frames with a pose, of those sent": lambda mode: _percent(mode["share_of_frames"]),
-    "passes over a frame": lambda mode: "-" if mode["passes"] is None else f"{mode['passes']:.2f}",
-    "frames a second": lambda mode: f"{mode['rate_hz']:.1f}",
-    "in one process, one after the other": lambda mode: f"{mode['plain_loop_rate_hz']:.1f}",
-    "latency, ms at 50, 90 and 99 %": lambda mode: _three({p: mode["latency_ms"][p] for p in ("p50", "p90", "p99")}),
-    "of it no process's own work": lambda mode: _percent(mode["bus_share"]),
-    "error, median": _errors,
-    "messages lost": lambda mode: f"{mode['messages']['lost']}",
+    "frames with a pose, of those sent": lambda f: _percent(f["share_of_frames"]),
+    "carried on": lambda f: f"{f['carried']}",
+    "poses a second": lambda f: f"{f['poses_per_s']:.1f}",
+    "capture to state, ms at 50, 90 and 99 %": lambda f: _row(f["latency_ms"], ("p50", "p90", "p99"), 0),
+    "rotation error, degrees: median, 99 %, highest": lambda f: _row(f["rotation_error_deg"], _ERRORS, 3),
+    "translation error: median, 99 %, highest": lambda f: _row(f["translation_error"], _ERRORS, 4),
+    "jitter, degrees and units": lambda f: _row(f["jitter"], ("rotation_deg", "translation"), 4),
+    "wrong while TRACKING": lambda f: f"{f['wrong_while_tracking']}",
+    "states": lambda f: ", ".join(f"{state} {count}" for state, count in f["states"].items()),
+    "ready, s; then first pose, s": lambda f: f"{_number(f['ready_s'], 1)}  {_number(f['first_pose_s'], 2)}",
+    "memory, MB": lambda f: _number(f["pss_mb"], 0),
 }
+
+
+def _row(values: dict[str, float | None] | None, names: tuple[str, ...], digits: int) -> str:
+    return "  ".join(_number(values[name], digits) for name in names) if values else "-"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
 
 
 def _percent(share: float | None) -> str:

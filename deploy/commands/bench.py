@@ -183,34 +183,52 @@ class Bus:
 
 @dataclass(frozen=True)
 class Track:
-    """Following a camera: the demo's sequence, live through the real processes, and in one process, frame by frame.
+    """Following a camera live, as whoever uses the poses meets it: sequences at their own pace, by the real processes.
 
     Example: fieldpose bench track --json out/bench/track.json
 
-    Mode default is what `fieldpose demo` does; in mode full every frame has all its passes, each of them refined, from
-    views of 400 pixels. The JSON file has: machine, modes (mode -> the keys of `fieldpose run`, and share_of_frames
-    (frames with a pose, of those sent), bus_share (of a frame's time from camera to state, the share in which no
-    process was at work for it: transport, decoding, waiting), cpu_by_process (seconds, its start included),
-    rss_mb_by_process, plain_loop_rate_hz (in one process)), plain_loop_rate_hz (mode full's).
+    The JSON file has: machine, sequences (name -> cores -> number of cores -> share_of_frames, poses_per_s,
+    latency_ms, rotation_error_deg, translation_error, wrong_while_tracking, first_pose_s, ready_s, pss_mb, jitter and
+    more, which stand in deploy/benchmarks/followed.py; with the most cores also steps -> number -> share_right, of
+    all frames sent), ablations (name -> the same as under sequences, with the most cores), plain_loop_rate_hz (frames
+    a second in one process, of the first sequence, with all work done on each).
     """
 
+    sequences: tuple[str, ...] = ("demo", "kitchen")
+    """demo, kitchen (left out where ../shared/data/kitchen is not there), or recordings (.mcap) with true poses."""
+    field: Path | None = None
+    """The field of the recordings."""
+    kitchen_field: Path | None = None
+    """A field of ../shared/data/kitchen; one is trained and kept in the output folder where none is given."""
+    minutes: float = 5.0
+    """Time to train that for."""
+    cores: tuple[int, ...] = (2, 1)
+    """The whole pipeline is held to so many; those that this machine does not have are left out."""
+    steps: tuple[int, ...] = (1, 2, 3, 4, 6, 8)
+    """Only every so many-th frame is sent, at its own time."""
+    ablations: tuple[str, ...] = ()
+    """Changes of settings to measure besides, by default all. default: none; full: every frame has all its passes, each
+    of them refined, from views of 400 pixels."""
     frames: int | None = None
-    """Only so many, from the start of the sequence (default: all 300)."""
-    modes: tuple[str, ...] = ("full", "default")
-    """Both, or one of them."""
+    """Only so many, from the start of each sequence (default: all)."""
+    out: Path = Path("out/bench")
+    """Folder of the pictures, one of each run over time, and of the kitchen's field."""
     json: Path | None = None
 
     def run(self) -> int:
         """Measure, print."""
         check_writable(self.json)
-        if (self.frames is not None and self.frames < 1) or not self.modes:
-            raise UsageError("bench track: at least one frame and one mode are needed")
-        from fieldpose.deploy.benchmarks import track
+        from fieldpose.deploy.benchmarks import sequences, track
 
+        ablations = self.ablations or tuple(track.ABLATIONS)
+        wanted = track.Wanted(self.cores, self.steps, ablations, self.out, self.frames)
+        fields = sequences.Fields(_DATA / "kitchen", self.out, self.minutes, self.kitchen_field, self.field)
         # No display that moves: it would take time from the processes.
-        figures = track.measure(self.modes, self.frames, _into(progress_console().print, "bench track"))
+        report = _into(progress_console().print, "bench track")
+        figures = track.measure(sequences.found(self.sequences, fields, report), wanted, report)
         write_json(self.json, figures)
         tables.print_track(figures)
+        print(f"each run over time: {self.out / 'track-*.png'}")
         return 0
 
 

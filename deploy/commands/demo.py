@@ -12,7 +12,7 @@ from typing import Annotated
 import tyro
 from rich.progress import Progress
 
-from fieldpose.deploy.commands.run import INTERRUPTED, give_out, planned
+from fieldpose.deploy.commands.run import INTERRUPTED, draw, give_out, planned
 from fieldpose.deploy.processes.pipeline import Run, run_pipeline
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_bytes, write_json
 from fieldpose.deploy.reporting.report import live_line
@@ -28,8 +28,9 @@ class Options:
     Example: fieldpose demo --out out/demo
 
     It plays at the camera's own 30 frames a second; what the pipeline cannot keep up with is dropped at the door.
-    Writes into the folder: summary.json (keys as of `fieldpose run`), recording.mcap, and overlay.jpg and
-    overlay.mp4: the field rendered at the poses found, over the camera's images.
+    Writes into the folder: summary.json (keys as of `fieldpose run`), recording.mcap, timeline.png (errors, scores,
+    latencies and states over time), and overlay.jpg and overlay.mp4: the field rendered at the poses found, over the
+    camera's images.
     """
 
     out: Path = Path("out/demo")
@@ -37,7 +38,7 @@ class Options:
     json: Path | None = None
     """Write the figures into this file too."""
     video: bool = True
-    """Write the picture and the video."""
+    """Write overlay.jpg and overlay.mp4."""
     logs: Path | None = None
     """Keep the logs of the processes in this folder."""
     config: Path | None = None
@@ -53,26 +54,32 @@ class Options:
         plan = planned(replace(self.settings, camera=camera), field)
         with live_line("demo") as report:
             outcome = run_pipeline(Run(plan, recording, logs=self.logs), report)
-        summary = give_out(outcome, "demo", self.out / "summary.json")
+        written = [recording, self.out / "summary.json"]
+        summary = give_out(outcome, "demo", written[-1])
         write_json(self.json, summary)
         if outcome.interrupted:
             return INTERRUPTED
+        written.append(self.out / "timeline.png")
+        draw(outcome, plan, written[-1], "demo")
         if self.video:
-            self._show(outcome, field, recording)
-        print(f"written: {', '.join(str(path) for path in sorted(self.out.iterdir()))}")
+            written += self._show(outcome, field, recording)
+        print(f"written: {', '.join(map(str, written))}")
         return 0
 
-    def _show(self, outcome: RunResult, field: Path, recording: Path) -> None:
+    def _show(self, outcome: RunResult, field: Path, recording: Path) -> list[Path]:
+        """Write the picture and the video; returns those that there are, none without any frame that was answered."""
         from fieldpose.deploy.reporting.overlay import encoded
         from fieldpose.deploy.reporting.showing import pictures, write_video
         from fieldpose.stages.nerf.loading import load_renderer
 
+        video, still = self.out / "overlay.mp4", self.out / "overlay.jpg"
         renderer = load_renderer(field, threads=0, backend=self.settings.backend)
         with _bar("rendering the video") as report:
-            best = write_video(self.out / "overlay.mp4", pictures(recording, outcome.frames, renderer, report))
-        if best is not None:
-            path = self.out / "overlay.jpg"
-            write_bytes(path, encoded(best.pixels, path))
+            best = write_video(video, pictures(recording, outcome.frames, renderer, report))
+        if best is None:
+            return []
+        write_bytes(still, encoded(best.pixels, still))
+        return [still, video]
 
 
 @contextmanager

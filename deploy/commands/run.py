@@ -11,7 +11,7 @@ import tyro
 
 from fieldpose.deploy.plan import Plan, resolve
 from fieldpose.deploy.processes.pipeline import Run, run_pipeline
-from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
+from fieldpose.deploy.reporting.output import check_picture, check_writable, write_bytes, write_json
 from fieldpose.deploy.reporting.report import live_line, print_plan, print_summary
 from fieldpose.deploy.reporting.results import RunResult, summarise, to_csv
 from fieldpose.deploy.settings import Settings, overridden
@@ -45,6 +45,8 @@ class Options:
     """Write the figures of the run into this file."""
     csv: Path | None = None
     """Write a row for each frame into this file."""
+    plot: Path | None = None
+    """Draw errors, scores, latencies and states over time into this file (.png, .svg or .pdf)."""
     guess: str | None = None
     """Where to begin: perturb:10-40deg,0.2 (each frame's true pose, disturbed), train:NAME, or a JSON file; without
     it, training views that look like the frame (short for --tracking.guess)."""
@@ -82,9 +84,12 @@ class Options:
             print_plan(plan)
             return 0
         check_writable(self.record, self.json, self.csv)
+        check_picture(self.plot)
         with live_line(source) as report:
             outcome = run_pipeline(Run(plan, self.record, self.listen, self.logs), report)
         give_out(outcome, source, self.json, self.csv)
+        if self.plot is not None:
+            draw(outcome, plan, self.plot, source)
         return INTERRUPTED if outcome.interrupted else 0
 
     def with_shortcuts(self) -> Settings:
@@ -117,3 +122,10 @@ def give_out(outcome: RunResult, title: str, json: Path | None, csv: Path | None
     if csv is not None:
         write_bytes(csv, to_csv(outcome.frames))
     return summary
+
+
+def draw(outcome: RunResult, plan: Plan, path: Path, title: str) -> None:
+    """Draw a run over time. Raises OutputError."""
+    from fieldpose.deploy.reporting.timeline import plot_timeline
+
+    plot_timeline(outcome.frames, path, title, live=plan.settings.camera.pace == "live")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter, OrderedDict, deque
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from fieldpose.bus.messages import Header, Message, Reason, State, Stats, Truth
 from fieldpose.bus.ports import Inbox, Sequences
 from fieldpose.bus.protocol import Bus
 from fieldpose.bus.topics import FRAME, GUESS, STATE, STATS, TRUTH, Address, Topic
-from fieldpose.deploy.graph import BETWEEN_STAGES
+from fieldpose.deploy.graph import BETWEEN_STAGES, CAMERA
 from fieldpose.deploy.reporting.results import FrameResult, Outcome, TruthKnown
 from fieldpose.errors import CodecError
 
@@ -135,32 +135,38 @@ def _result(frame_id: int, seen: _Seen) -> FrameResult:
         reason=str(state.reason) if state is not None and state.reason is not None else None,
         camera_origin=str(state.camera_origin) if state is not None else None,
         cam_from_object=_copied(found),
+        carried=_copied(state.cam_from_object) if state is not None and found is None else None,
         covariance=None if found is None or state is None else _copied(state.covariance),
         truth=None if seen.truth is None else TruthKnown(_copied(seen.truth.cam_from_object)),
         sent_ns=seen.camera_sent_ns,
         answered_ns=None if state is None else state.header.sent_ns,
-        stage_ms=dict(_stage_ms(seen)),
+        stage_ms=_stage_ms(seen),
     )
 
 
 def _outcome(seen: _Seen) -> Outcome:
-    if not seen.sent:
-        return "dropped"
-    return "lost" if seen.state is None or seen.state.reason is Reason.NO_ANSWER else "finished"
+    """What has a state is finished, whether or not any stage has worked on it."""
+    if seen.state is None:
+        return "lost" if seen.sent else "dropped"
+    return "lost" if seen.state.reason is Reason.NO_ANSWER else "finished"
 
 
-def _stage_ms(seen: _Seen) -> Iterator[tuple[str, float]]:
-    """How long each process took for the frame, all passes together: from what was sent before to its own sending."""
-    sent = list(seen.sent)
-    if seen.state is not None:
-        sent.append((seen.state.header.sent_ns, seen.state.header.source))
+def _stage_ms(seen: _Seen) -> dict[str, float]:
+    """How long each process took for the frame, all passes together: from what was sent before to its own sending.
+
+    A state may come before the stages are done with the frame; none of them has then waited for it.
+    """
+    sent = sorted(seen.sent)
+    if seen.camera_sent_ns is not None:
+        sent.insert(0, (seen.camera_sent_ns, CAMERA))
     total: dict[str, float] = {}
-    before = seen.camera_sent_ns
-    for now, source in sorted(sent):
-        if before is not None:
-            total[source] = total.get(source, 0.0) + (now - before) / 1e6
-        before = now
-    yield from total.items()
+    for (before, _), (now, source) in pairwise(sent):
+        total[source] = total.get(source, 0.0) + (now - before) / 1e6
+    if seen.state is not None:
+        now, source = seen.state.header.sent_ns, seen.state.header.source
+        before = max((at for at, _ in sent if at <= now), default=now)
+        total[source] = total.get(source, 0.0) + (now - before) / 1e6
+    return total
 
 
 def _copied(array: np.ndarray | None) -> np.ndarray | None:

@@ -7,9 +7,9 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -64,7 +64,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Progress:
-    """What a run is doing, for people to look at."""
+    """What a run is doing, for people to look at; `pids`: its processes by name."""
 
     phase: Literal["starting", "running", "finishing"]
     waiting_for: tuple[str, ...] = ()
@@ -72,6 +72,7 @@ class Progress:
     rate_hz: float = 0.0
     state: State | None = None
     restarts: int = 0
+    pids: Mapping[str, int] = field(default_factory=dict)
 
 
 Report = Callable[[Progress], None]
@@ -124,6 +125,7 @@ class _Running:
         self._stop = signals.stop
         self._report = report
         self._limit = _RESTARTS_AT_START
+        self._pids: dict[str, int] = {}
 
     def run(self) -> RunResult:
         began = time.monotonic()
@@ -183,7 +185,9 @@ class _Running:
     def _look(self, collector: Collector) -> bool:
         """Take in what has come and check on the processes; returns whether the camera has finished."""
         collector.update()
-        camera = self._supervisor.check(self._limit).get(CAMERA)
+        processes = self._supervisor.check(self._limit)
+        self._pids = {name: process.pid for name, process in processes.items() if process.pid}
+        camera = processes.get(CAMERA)
         return camera is not None and camera.finished
 
     def _finish(self, collector: Collector, finished: bool) -> None:
@@ -203,6 +207,7 @@ class _Running:
             rate_hz=collector.rate_hz(time.time_ns()),
             state=collector.newest_state,
             restarts=sum(self._supervisor.restarts.values()),
+            pids=self._pids,
         )
 
 

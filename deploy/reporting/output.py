@@ -13,6 +13,8 @@ from rich.console import Console
 from fieldpose.errors import OutputError
 
 _FILE_WIDTH = 140
+PICTURES = (".png", ".svg", ".pdf")
+"""What a plot may be written as."""
 
 
 def progress_console() -> Console:
@@ -43,6 +45,13 @@ def write_json(path: Path | None, value: Any) -> None:
     """Write anything that msgspec can encode as indented JSON; nothing where `path` is None. Raises OutputError."""
     if path is not None:
         write_bytes(path, msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n")
+
+
+def check_picture(path: Path | None) -> None:
+    """Raise OutputError where a plot could not be written later, for its place or its kind."""
+    check_writable(path)
+    if path is not None and path.suffix not in PICTURES:
+        raise OutputError(f"{path}: no name of a plot; end it in {', '.join(PICTURES[:-1])} or {PICTURES[-1]}")
 
 
 def check_writable(*paths: Path | None) -> None:

@@ -1,10 +1,10 @@
 """What a run has achieved: a row for each frame, and the figures that `--json` gives.
 
 The keys of a summary, which programs may rely on:
-  frames             frames that tracking let in and that have come to an end, with a pose or without
+  frames             frames that have come to an end, with a pose or without
   frames_lost        of these, the frames that were given up because no answer came (a stage died)
   frames_sent        frames that the camera has sent
-  dropped_at_the_door  frames that tracking did not let in, because enough were in flight
+  dropped_at_the_door  frames that tracking has not answered and not let in, because enough were in flight
   poses_ok           frames with a measured pose
   frames_with_truth  frames whose true pose is known, with the object in view
   rotation_error_deg, translation_error  {mean, median, p90} over the frames with both poses; null without any
@@ -14,7 +14,7 @@ The keys of a summary, which programs may rely on:
   rate_hz            finished frames a second, from the first frame sent to the last answer
   latency_ms         {p50, p90, p99, by_stage}: from the camera's sending a frame to its state, all passes included;
                      by_stage: name -> {p50, p90}, waiting and transport included
-  passes             mean number of passes over a frame
+  passes             mean number of passes over a frame that the stages have worked on
   states             tracking's state -> number of frames
   reasons            why frames have no measured pose -> number of frames
   cameras            where the intrinsics of frames come from -> number of frames; poses by an assumed one are not sure
@@ -62,7 +62,8 @@ class TruthKnown:
 class FrameResult:
     """What became of a frame; `cam_from_object` is the pose measured, None where none was.
 
-    covariance: (6, 6) of the pose's left twist, where it is known.
+    carried: the pose that tracking carried on with where none was measured. covariance: (6, 6) of the pose's left
+    twist, where it is known. level: how much was done to save time, where the pipeline adapts itself.
     """
 
     frame_id: int
@@ -74,11 +75,13 @@ class FrameResult:
     reason: str | None = None
     camera_origin: str | None = None
     cam_from_object: np.ndarray | None = None
+    carried: np.ndarray | None = None
     covariance: np.ndarray | None = None
     truth: TruthKnown | None = None
     sent_ns: int | None = None
     answered_ns: int | None = None
     stage_ms: Mapping[str, float] = field(default_factory=dict)
+    level: int | None = None
 
     @property
     def true_pose(self) -> np.ndarray | None:
@@ -99,6 +102,13 @@ class FrameResult:
         if self.outcome != "finished" or self.sent_ns is None or self.answered_ns is None:
             return None
         return (self.answered_ns - self.sent_ns) / 1e6
+
+    @property
+    def age_ms(self) -> float | None:
+        """From the frame's capture to the state; it means something where frames are sent as they are captured."""
+        if self.outcome != "finished" or self.answered_ns is None:
+            return None
+        return (self.answered_ns - self.capture_ns) / 1e6
 
 
 @dataclass(frozen=True)
@@ -124,6 +134,7 @@ def summarise(run: RunResult) -> dict[str, Any]:
     """The figures of a run, under the keys that this module's description lists."""
     admitted = [result for result in run.frames if result.outcome != "dropped"]
     latencies = [result.latency_ms for result in admitted if result.latency_ms is not None]
+    passes = [result.passes for result in admitted if result.passes]
     return {
         "frames": len(admitted),
         "frames_lost": sum(result.outcome == "lost" for result in admitted),
@@ -133,7 +144,7 @@ def summarise(run: RunResult) -> dict[str, Any]:
         **accuracy(admitted),
         "rate_hz": rate_hz(admitted),
         "latency_ms": {**_quantiles(latencies, (50, 90, 99)), "by_stage": _by_stage(admitted)},
-        "passes": float(np.mean([result.passes for result in admitted])) if admitted else None,
+        "passes": float(np.mean(passes)) if passes else None,
         "states": dict(Counter(result.state for result in admitted if result.state is not None)),
         "reasons": dict(Counter(result.reason for result in admitted if result.reason is not None)),
         "cameras": dict(Counter(result.camera_origin for result in admitted if result.camera_origin is not None)),

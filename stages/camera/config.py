@@ -31,6 +31,8 @@ class CameraConfig:
     auto: live for what has times of its own, lockstep for photos."""
     rate_hz: float | None = None
     """Frames a second instead of the source's own times."""
+    every: int = 1
+    """Send only every so many-th frame, at its own time."""
     frames: int | None = None
     """Stop after so many."""
     answer_timeout_s: float = 15.0
@@ -39,7 +41,7 @@ class CameraConfig:
     """Notes which frame comes next, so that a camera that is started again goes on there."""
 
     def __post_init__(self) -> None:
-        for name in ("size", "rate_hz", "frames", "answer_timeout_s"):
+        for name in ("size", "rate_hz", "every", "frames", "answer_timeout_s"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ConfigError(f"camera: {name} is {value}, but must be more than 0")

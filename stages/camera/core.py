@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Literal
 
 import numpy as np
@@ -64,7 +65,7 @@ class Source:
 
 
 class Feed:
-    """Gives each frame when it is due, and knows when all have been answered."""
+    """Gives each frame when it is due, and knows when all have been answered; `first` were sent before."""
 
     def __init__(self, source: Source, config: CameraConfig, first: int = 0) -> None:
         self._pace = source.pace(config.pace)
@@ -72,7 +73,8 @@ class Feed:
         self._rate_hz = config.rate_hz
         self._timeout_ns = int(config.answer_timeout_s * 1e9)
         self._left = None if config.frames is None else config.frames - first
-        self._frames = source.frames(first)
+        self._frames = source.frames(first * config.every)
+        self._sent_ones = islice(self._frames, 0, None, config.every)
         self._next: CapturedFrame | None = None
         self._exhausted = False
         self._start: tuple[int, int] | None = None
@@ -139,7 +141,7 @@ class Feed:
 
     def _peek(self) -> CapturedFrame | None:
         if self._next is None and not self._exhausted:
-            self._next = next(self._frames, None) if self._left is None or self._sent < self._left else None
+            self._next = next(self._sent_ones, None) if self._left is None or self._sent < self._left else None
             self._exhausted = self._next is None
         return self._next
 

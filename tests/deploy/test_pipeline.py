@@ -80,12 +80,14 @@ def test_a_stage_killed_in_the_demo_comes_back_and_the_recording_is_whole(
             killed.append(pid_of("rendering"))
             os.kill(killed[0], signal.SIGKILL)
 
+    older = tmp_path / "older.txt"
+    older.touch()
     monkeypatch.setattr("fieldpose.deploy.commands.demo.live_line", lambda title: nullcontext(kill_rendering))
     assert main(["demo", "--out", str(tmp_path), *SMALL]) == 0
     assert killed
     assert descendants() <= before
     assert {path.name for path in tmp_path.iterdir()} == {
-        "summary.json", "recording.mcap", "overlay.jpg", "overlay.mp4",
+        older.name, "summary.json", "recording.mcap", "timeline.png", "overlay.jpg", "overlay.mp4",
     }  # fmt: skip
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["restarts"] == {"rendering": 1}
@@ -105,6 +107,8 @@ def test_a_stage_killed_in_the_demo_comes_back_and_the_recording_is_whole(
     assert set(held.attachments) == {"settings.json", "field.safetensors"}
     said = capsys.readouterr().out
     assert "rendering 1x" in said
+    assert "timeline.png" in said
+    assert older.name not in said
 
     figures = tmp_path / "replay.json"
     assert main(["replay", str(tmp_path / "recording.mcap"), "--json", str(figures)]) == 0

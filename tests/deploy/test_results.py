@@ -170,6 +170,33 @@ def test_a_failure_ends_a_pass_and_its_reason_is_told(collected: tuple[Collector
     assert summarise(RunResult([row]))["reasons"] == {"nothing_in_view": 1}
 
 
+def test_a_state_of_its_own_ends_a_frame_whatever_the_stages_do(
+    collected: tuple[Collector, dict[str, Outbox]],
+) -> None:
+    collector, outboxes = collected
+    for frame_id in range(4):
+        outboxes["camera"].publish(FRAME, bus_samples.frame(frame_id))
+    outboxes["tracking"].publish(STATE, state(first_header(0, 1000), np.eye(4), 0.9))
+    outboxes["tracking"].publish(STATE, state(first_header(1, 1001), np.eye(4), 0.8))
+    one_pass(outboxes, 1)
+    outboxes["tracking"].publish(STATE, state(first_header(2, 1002), moved(shift=0.1), 0.0, Reason.NO_CONSENSUS))
+    collector.update()
+    rows = collector.results()
+    assert [row.outcome for row in rows] == ["finished", "finished", "finished", "dropped"]
+    assert [row.passes for row in rows[:3]] == [0, 1, 0]
+    assert set(rows[0].stage_ms) == {"tracking"}
+    assert rows[1].stage_ms["refinement"] > 0
+    latency = rows[1].latency_ms
+    assert latency is not None
+    assert rows[1].stage_ms["tracking"] >= latency
+    assert rows[2].cam_from_object is None
+    assert rows[2].carried is not None
+    assert rows[0].carried is None
+    summary = summarise(RunResult(rows, collector.sent))
+    assert (summary["frames"], summary["poses_ok"], summary["dropped_at_the_door"]) == (3, 2, 1)
+    assert summary["passes"] == 1.0
+
+
 def test_the_documented_keys_are_there(collected: tuple[Collector, dict[str, Outbox]]) -> None:
     collector, outboxes = collected
     outboxes["camera"].publish(FRAME, bus_samples.frame(0))

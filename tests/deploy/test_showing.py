@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,10 +14,11 @@ from support.chain import frame_message
 from fieldpose.bus.messages import Header
 from fieldpose.bus.recording import RecordingWriter
 from fieldpose.bus.topics import FRAME, Address
-from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
+from fieldpose.deploy.reporting.output import PICTURES, check_picture, check_writable, write_bytes, write_json
 from fieldpose.deploy.reporting.overlay import EDGE_RGB, encoded, overlaid
 from fieldpose.deploy.reporting.results import FrameResult, TruthKnown
 from fieldpose.deploy.reporting.showing import pictures, write_video
+from fieldpose.deploy.reporting.timeline import plot_timeline, state_spans
 from fieldpose.errors import OutputError
 from fieldpose.stages.geometry import perturb
 
@@ -81,6 +83,36 @@ def test_no_finished_frame_makes_no_video(tmp_path: Path) -> None:
     assert not (tmp_path / "a.mp4").exists()
 
 
+@pytest.mark.parametrize("kind", PICTURES)
+def test_a_timeline_shows_what_is_known_of_each_frame(tmp_path: Path, kind: str) -> None:
+    pose, ms = viewpoint(), 10**6
+    known = FrameResult(
+        0, 0, "finished", state="tracking", score=0.9, cam_from_object=pose, truth=TruthKnown(viewpoint(21)),
+        sent_ns=ms, answered_ns=50 * ms, level=1,
+    )  # fmt: skip
+    frames = [
+        known,
+        replace(known, capture_ns=33 * ms, answered_ns=90 * ms, truth=None, level=None),
+        replace(known, capture_ns=66 * ms, answered_ns=99 * ms, state="lost", cam_from_object=None, carried=pose),
+        FrameResult(3, 100 * ms, "dropped"),
+        FrameResult(4, 133 * ms, "lost", state="lost"),
+    ]
+    for name, shown in (("all", frames), ("dropped", frames[3:4]), ("none", [])):
+        path = tmp_path / f"{name}{kind}"
+        plot_timeline(shown, path, "test", live=name == "all")
+        assert path.stat().st_size > 1000
+
+
+def test_states_last_until_the_next_one() -> None:
+    states = ["initializing", None, "tracking", "tracking", "lost", "tracking"]
+    timed = [(float(i), FrameResult(i, i, "finished", state=state)) for i, state in enumerate(states)]
+    spans = state_spans(timed)
+    assert spans["initializing"] == [(0.0, 2.0)]
+    assert spans["lost"] == [(4.0, 1.0)]
+    assert [start for start, _ in spans["tracking"]] == [2.0, 5.0]
+    assert state_spans([]) == {}
+
+
 def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
     write_json(tmp_path / "new" / "a.json", {"x": [1, 2]})
     assert (tmp_path / "new" / "a.json").read_text().startswith('{\n  "x"')
@@ -91,5 +123,7 @@ def test_files_are_whole_or_not_there(tmp_path: Path) -> None:
         encoded(np.zeros((4, 4, 3), np.uint8), Path("a.what"))
     with pytest.raises(OutputError, match="is a folder"):
         check_writable(tmp_path)
+    with pytest.raises(OutputError, match=r"end it in \.png, \.svg or \.pdf"):
+        check_picture(tmp_path / "a.gif")
     with pytest.raises(OutputError, match="its folder cannot be made"):
         check_writable(tmp_path / "new" / "a.json" / "b.json")

@@ -48,6 +48,13 @@ def test_live_frames_go_when_their_own_times_say_so() -> None:
     assert sent(live, 1000) == [(3, 200), (4, 233)]
 
 
+def test_every_other_frame_goes_at_its_own_time_and_a_second_start_goes_on_there() -> None:
+    every_other = feed("own", every=2)
+    assert sent(every_other, 0) == [(0, 0)]
+    assert sent(every_other, 1000) == [(2, 67), (4, 233)]
+    assert [frame_id for frame_id, _ in sent(feed("none", every=2, first=1, pace="fast"), 0)] == [2, 4]
+
+
 def test_a_rate_replaces_the_times() -> None:
     assert [sent(feed_, 0) + sent(feed_, 99) + sent(feed_, 100) for feed_ in [feed("own", rate_hz=10)]] == [
         [(0, 0), (1, 100)]

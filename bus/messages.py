@@ -30,6 +30,7 @@ class Reason(StrEnum):
     TOO_FEW_CONSISTENT_POINTS = "too_few_consistent_points"
     NO_CONSENSUS = "no_consensus"
     IMPLAUSIBLE_POSE = "implausible_pose"
+    CAMERA_DIFFERS = "camera_differs"
     NO_ANSWER = "no_answer"
     NO_GUESS = "no_guess"
     INTERNAL_ERROR = "internal_error"
@@ -329,7 +330,8 @@ class Followed(Message, kw_only=True):
 class State(Message, kw_only=True):
     """What tracking believes after each frame, and what it has counted at its door since it started.
 
-    A pose with a score of 0 was not measured but carried on from before; `reason` says why nothing was measured.
+    A pose with a score of 0 was not measured but carried on from before; `reason` says why nothing was measured, or why
+    what was is not sure (camera_differs: the focal length is not as said).
     level: how much following does less than it might, for want of time; 0 for nothing less.
     """
 

@@ -25,8 +25,12 @@ from fieldpose.errors import UsageError
 DEFAULT, FULL = "default", "full"
 ABLATIONS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
+    "following off": {"following": {"when": "never"}},
+    "prefetch off": {"following": {"ahead": 0.0}},
+    "adaptation off": {"following": {"budget": float("inf")}},
     # No pose is near enough to its guess, so that every frame has all its passes.
     FULL: {
+        "following": {"when": "never"},
         "tracking": {name: {"angle_deg": 0.0, "distance": 0.0} for name in ("settled", "far")},
         "rendering": {"size": 400},
         "refinement": {"when": "always"},

@@ -132,6 +132,7 @@ def _result(frame_id: int, seen: _Seen) -> FrameResult:
         passes=seen.passes,
         state=str(state.state) if state is not None else None,
         score=state.score if state is not None else 0.0,
+        level=None if state is None else state.level,
         reason=str(state.reason) if state is not None and state.reason is not None else None,
         camera_origin=str(state.camera_origin) if state is not None else None,
         cam_from_object=_copied(found),

@@ -84,7 +84,8 @@ def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "frames sent / dropped at the door", f"{sent} / {dropped}"
     yield "frames / with a pose / lost", f"{summary['frames']} / {summary['poses_ok']} / {summary['frames_lost']}"
     if summary["reasons"]:
-        yield "without a pose because", ", ".join(f"{reason} {count}x" for reason, count in summary["reasons"].items())
+        reasons = ", ".join(f"{reason} {count}x" for reason, count in summary["reasons"].items())
+        yield "not sure, or without a pose, because", reasons
     if summary["cameras"].keys() - {"calibrated"}:
         yield (
             "camera taken from",

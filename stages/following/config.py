@@ -28,6 +28,8 @@ class FollowingConfig:
     seen what the camera will see soon"""
     fresh_deg: float = 3.5
     """how differently from the nearest view the camera may see things before another view is asked for"""
+    ahead: float = 1.0
+    """for how much of the time that a view takes it is asked for ahead of the motion"""
     same: Limit = Limit(2.0, 0.02)
     """a solve's pose further than this from what was followed speaks against that; x scale"""
     found_again: float = 0.6
@@ -41,7 +43,10 @@ class FollowingConfig:
         refuse_below(
             "following",
             self,
-            {"landmarks": 8, "views": 1, "budget": 0, "solve_ms": 0, "fresh_deg": 0, "lost_after": 1, "weak_after": 1},
+            {
+                "landmarks": 8, "views": 1, "budget": 0, "ahead": 0, "solve_ms": 0, "fresh_deg": 0, "lost_after": 1,
+                "weak_after": 1,
+            },
         )
 
 

@@ -7,7 +7,7 @@ tells how far the pose is to be trusted. Source: Klein and Murray, Parallel trac
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from cachetools import LRUCache
 
 from fieldpose.stages.alignment.agreement import covariance_of, fit_agreeing
 from fieldpose.stages.alignment.constants import FOUND_PX
+from fieldpose.stages.alignment.focal import focal_error
 from fieldpose.stages.alignment.images import FramePyramid
 from fieldpose.stages.alignment.landmarks import landmarks
 from fieldpose.stages.alignment.least_squares import CONVERGED, PoseFit
@@ -47,6 +48,7 @@ class Followed:
     covariance: (6, 6) of the left twist, as for a single image; noise: the part of it that each frame has anew.
     pixels: (n, 2) of the frame, whose longer side was so long, where points were looked for, at the pose; found: (n,)
     which of them were found.
+    focal_error: how much longer the focal length is than said, as a share, with its standard deviation, focal_sigma.
     level: how coarse the images were, 0 for not at all.  angle: typical one, in radians, between the directions from
     which the points are seen in their views and in the frame.
     """
@@ -60,6 +62,8 @@ class Followed:
     residual_px: float
     level: int
     angle: float
+    focal_error: float
+    focal_sigma: float
 
 
 class Follower:
@@ -94,7 +98,7 @@ class Follower:
         """How differently, in radians, the nearest view has seen what a camera there sees; infinite without any."""
         return min((difference(view, cam_from_object) for view in self._views.values()), default=np.inf)
 
-    def follow(self, frame: FramePyramid, starts: Sequence[Transform], points: int) -> Followed | None:
+    def follow(self, frame: FramePyramid, starts: Iterable[Transform], points: int) -> Followed | None:
         """The frame's pose near one of the poses to start from, the most likely first; None where too few are found.
 
         points: how many are looked for at most.
@@ -176,7 +180,7 @@ def _described(
     rms = float(np.sqrt((fit.errors[0] ** 2).sum(axis=1).mean()))
     return Followed(
         pose, covariance_of(fit, fitted, longer_side, angle), noise, longer_side, pixels.astype(np.float32),
-        is_found(found, points, agreeing), rms, level, angle,
+        is_found(found, points, agreeing), rms, level, angle, *focal_error(fit),
     )  # fmt: skip
 
 

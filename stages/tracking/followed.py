@@ -8,7 +8,7 @@ the newest frame, and so never pulls the pose back.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,9 @@ from fieldpose.bus.messages import GuessReason, Reason
 from fieldpose.stages.alignment.images import FramePyramid
 from fieldpose.stages.following.config import POINTS_BY_LEVEL, FollowingConfig
 from fieldpose.stages.following.core import Followed, Follower
+from fieldpose.stages.following.turning import turned
 from fieldpose.stages.nerf.training_views import TrainingViews
+from fieldpose.stages.tracking.certainty import FocalCheck
 from fieldpose.stages.tracking.config import TrackingConfig
 from fieldpose.stages.tracking.motion import NS_PER_MS
 from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, PoseResult, Step
@@ -67,13 +69,14 @@ class FollowedPolicy(VideoPolicy):
         self._kept: deque[Seen] = deque(maxlen=_KEPT_FRAMES)
         self._measured: FIFOCache[int, Measured] = FIFOCache(_KEPT_FRAMES)
         self._asked_ns: int | None = None
+        self._focal = FocalCheck()
 
     def follow(self, frame: FrameInfo, image: FramePyramid | None) -> tuple[Belief, Followed | None]:
         """What is believed of a new frame, and what was measured of it; image: None for a frame that is unreadable."""
         if image is None:
             return self._not_followed(frame, Reason.FRAME_UNREADABLE), None
         self._kept.append(Seen(frame, image))
-        measured = self._measure(self._kept[-1], self._starts(frame))
+        measured = self._measure(self._kept[-1], self._starts(frame, image))
         if measured is None:
             return self._not_followed(frame, Reason.NO_CONSENSUS), None
         tracked = self._on_track(frame)
@@ -88,7 +91,7 @@ class FollowedPolicy(VideoPolicy):
         if not self._trust.tracked or measured is None or measured.quality < self._config.score.good:
             self._asked_ns = frame.capture_ns
             return super().first_step(frame)
-        ahead = self._motion.predict(frame.capture_ns + int(self.ahead_ms * NS_PER_MS))
+        ahead = self._motion.predict(frame.capture_ns + int(self._follows.ahead * self.ahead_ms * NS_PER_MS))
         if not self._due(frame.capture_ns) and self.follower.angle(ahead) < np.deg2rad(self._follows.fresh_deg):
             return None
         self._asked_ns = frame.capture_ns
@@ -144,16 +147,27 @@ class FollowedPolicy(VideoPolicy):
     def _on_track(self, frame: FrameInfo) -> bool:
         return self._trust.tracked and self._motion.within_horizon(frame.capture_ns)
 
-    def _starts(self, frame: FrameInfo) -> Sequence[np.ndarray]:
-        """Where to look, the most likely first: where a prior says, where the motion leads, where the camera was."""
-        if len(self._motion) == 0:
-            return []
-        moved = [self._motion.predict(frame.capture_ns)] if self._on_track(frame) else []
-        prior = self._priors.peek(frame.frame_id)
-        return [*([] if prior is None else [prior]), *moved, self._motion.newest]
+    def _starts(self, frame: FrameInfo, image: FramePyramid) -> Iterator[np.ndarray]:
+        """Where to look, the most likely first: where a prior says, where the motion leads, where the camera was.
 
-    def _measure(self, seen: Seen, starts: Sequence[np.ndarray]) -> Measured | None:
-        if not starts or len(self.follower) == 0:
+        And where it would be if it had but turned as the whole image has shifted.
+        """
+        if len(self._motion) == 0:
+            return
+        prior = self._priors.peek(frame.frame_id)
+        if prior is not None:
+            yield prior
+        if self._on_track(frame):
+            yield self._motion.predict(frame.capture_ns)
+            yield self._motion.predict(frame.capture_ns, damped=False)
+        yield self._motion.newest
+        before = next((seen for seen in self._kept if seen.frame.capture_ns == self._motion.newest_ns), None)
+        turn = None if before is None else turned(before.image, image)
+        if turn is not None:
+            yield turn @ self._motion.newest
+
+    def _measure(self, seen: Seen, starts: Iterable[np.ndarray]) -> Measured | None:
+        if len(self.follower) == 0:
             return None
         followed = self.follower.follow(seen.image, starts, POINTS_BY_LEVEL[self.level])
         if followed is None:
@@ -181,7 +195,8 @@ class FollowedPolicy(VideoPolicy):
         else:
             self._trust.weak()
         covariance = self._certainty.of(measured.followed.covariance, pose, pose)
-        return Belief(self._trust.state, measured.quality, pose, covariance)
+        self._focal.note(measured.followed.focal_error, measured.followed.focal_sigma)
+        return self._focal.applied(Belief(self._trust.state, measured.quality, pose, covariance))
 
     def _not_followed(self, frame: FrameInfo, reason: Reason) -> Belief:
         was_tracked = self._trust.tracked

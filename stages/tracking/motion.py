@@ -67,9 +67,13 @@ class MotionModel:
         between_s = (self._times_ns[-1] - self._times_ns[reference]) * 1e-9
         return log_se3(self._poses[-1] @ inverse(self._poses[reference])) / between_s
 
-    def predict(self, capture_ns: int) -> np.ndarray:
-        """cam_from_object (4, 4) at a time after (or before) the newest pose; there must be one."""
-        ahead_s = self._damped((capture_ns - self._times_ns[-1]) * 1e-9)
+    def predict(self, capture_ns: int, damped: bool = True) -> np.ndarray:
+        """cam_from_object (4, 4) at a time after (or before) the newest pose; there must be one.
+
+        Not damped: as if the velocity did not decay.
+        """
+        ahead_s = (capture_ns - self._times_ns[-1]) * 1e-9
+        ahead_s = self._damped(ahead_s) if damped else ahead_s
         return exp_se3(self._clamped(self.velocity() * ahead_s)) @ self._poses[-1]
 
     def _reference(self) -> int | None:

@@ -25,6 +25,7 @@ from fieldpose.stages.tracking.config import TrackingConfig
 from fieldpose.stages.tracking.motion import NS_PER_MS
 from fieldpose.stages.tracking.policy import Attempt, Belief, FrameInfo, PoseResult, Step
 from fieldpose.stages.tracking.priors import Priors
+from fieldpose.stages.tracking.smoothing import PoseFilter
 from fieldpose.stages.tracking.video import VideoPolicy
 
 _KEPT_FRAMES = 64
@@ -70,6 +71,7 @@ class FollowedPolicy(VideoPolicy):
         self._measured: FIFOCache[int, Measured] = FIFOCache(_KEPT_FRAMES)
         self._asked_ns: int | None = None
         self._focal = FocalCheck()
+        self._filter = PoseFilter()
 
     def follow(self, frame: FrameInfo, image: FramePyramid | None) -> tuple[Belief, Followed | None]:
         """What is believed of a new frame, and what was measured of it; image: None for a frame that is unreadable."""
@@ -186,6 +188,7 @@ class FollowedPolicy(VideoPolicy):
     def _believe(self, frame: FrameInfo, measured: Measured) -> Belief:
         if not self._trust.tracked:
             self._motion.reset()
+            self._filter.reset()
         pose = measured.followed.cam_from_object
         self._motion.add(frame.capture_ns, pose)
         self._measured[frame.capture_ns] = measured
@@ -194,9 +197,11 @@ class FollowedPolicy(VideoPolicy):
             self._keyframes.add(pose)
         else:
             self._trust.weak()
-        covariance = self._certainty.of(measured.followed.covariance, pose, pose)
+        followed = measured.followed
+        smooth, rest = self._filter.update(frame.capture_ns, pose, followed.noise)
+        covariance = self._certainty.of(followed.covariance - followed.noise + rest, pose, pose)
         self._focal.note(measured.followed.focal_error, measured.followed.focal_sigma)
-        return self._focal.applied(Belief(self._trust.state, measured.quality, pose, covariance))
+        return self._focal.applied(Belief(self._trust.state, measured.quality, smooth, covariance))
 
     def _not_followed(self, frame: FrameInfo, reason: Reason) -> Belief:
         was_tracked = self._trust.tracked

@@ -148,7 +148,7 @@ class TestFile:
             ((schema, _, _),) = make_reader(stream).iter_messages()
         assert schema is not None
         state = json.loads(schema.data)["$defs"]["State"]
-        assert set(state["properties"]) - set(state["required"]) == {"reason", "camera_origin"}
+        assert set(state["properties"]) - set(state["required"]) == {"reason", "camera_origin", "level"}
 
     def test_chunks_are_uncompressed_and_of_a_few_megabytes(self, path: Path) -> None:
         writer = RecordingWriter(path)

@@ -7,11 +7,11 @@ from typing import Any
 import numba
 import pytest
 
-from fieldpose.stages import kernel_cache, pnp
+from fieldpose.stages import alignment, kernel_cache
 from fieldpose.stages.kernel_cache import SHARED_SOURCES, cache_folder, cached_njit, state_of
 from fieldpose.stages.nerf import kernels
 
-PACKAGES = (kernels, pnp)
+PACKAGES = (kernels, alignment)
 KNOWN = ("fieldpose.stages.fastmath", "fieldpose.stages.kernel_cache")
 
 

@@ -48,7 +48,7 @@ def make_nodes(scene: AnalyticScene) -> Callable[..., list[Any]]:
         refining = refinement or RefinementConfig(samples=300, held_out=150)
         nodes = [
             RenderingNode(lambda: ViewSource(scene, RenderingConfig(size=220, reuse_angle_deg=5.0))),
-            MatchingNode(lambda: PairMatcher(build_matcher(matching), matching), FrameImages()),
+            MatchingNode(lambda: PairMatcher(build_matcher(matching), matching), FrameImages(), 64),
             LiftingNode(lambda: scene, lifting or LiftingConfig(), ConsistencyMemory()),
             PnpNode(PnpConfig(), FrameImages()),
             RefinementNode(lambda: scene, refining, FrameImages()),

@@ -63,6 +63,16 @@ class Chosen:
             points.append(view.points[seen])
         return np.concatenate(pixels), np.concatenate(points)
 
+    def shift(self, frame: FramePyramid, first: Transform, second: Transform) -> float:
+        """By how many pixels, in the median, two poses put the points apart; infinite where one of them shows none."""
+        shifts = [np.zeros(0)]
+        for view, index in self.parts:
+            before, after = warped(view, frame, first), warped(view, frame, second)
+            both = index[before.seen[index] & after.seen[index]]
+            shifts.append(np.linalg.norm(before.starts[both] - after.starts[both], axis=1))
+        known = np.concatenate(shifts)
+        return float(np.median(known)) if len(known) else np.inf
+
     def angle(self, pose: Transform) -> float:
         """The typical angle, in radians, between the directions in which views and a pose see the points."""
         angles = [viewing_angles(view.points[index], view.cam_from_object, pose) for view, index in self.parts]

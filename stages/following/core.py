@@ -35,6 +35,8 @@ _GOOD_START = 0.5
 """Of the points: where so many are found from a start, no other is tried."""
 _BLURRED = 0.5
 """Where a finer level finds fewer than this share of what the coarser one has, the frame is blurred."""
+_FAR_PX = 2.0
+"""A pose that puts points so much elsewhere than its start is compared with the one that is found without that."""
 _BY_TURN = 0.3
 """What turning the camera on the spot counts, to turning it around what it sees."""
 _TYPICAL = 32
@@ -103,17 +105,20 @@ class Follower:
 
         points: how many are looked for at most.
         """
-        best: tuple[PoseFit, Chosen] | None = None
+        best: tuple[PoseFit, Chosen, Transform] | None = None
         for start in starts:
             chosen = self._chosen(frame, start, points)
             fit = _first_fit(chosen, frame, start)
             if fit is None:
                 continue
             if best is None or len(fit.pixels) > len(best[0].pixels):
-                best = fit, chosen
+                best = fit, chosen, start
             if len(fit.pixels) >= _GOOD_START * min(COARSE_POINTS, len(chosen)):
                 break
-        return None if best is None else _followed(best[1], frame, best[0])
+        if best is None:
+            return None
+        fit, chosen, start = best
+        return _better(chosen, frame, _followed(chosen, frame, fit.cam_from_object), start)
 
     def _chosen(self, frame: FramePyramid, pose: Transform, points: int) -> Chosen:
         nearest = sorted(self._views.values(), key=lambda view: difference(view, pose))[:TOGETHER]
@@ -157,10 +162,19 @@ def _refitted(found: Found, frame: FramePyramid, pose: Transform, level: int) ->
     )  # fmt: skip
 
 
-def _followed(chosen: Chosen, frame: FramePyramid, coarse: PoseFit) -> Followed | None:
+def _better(chosen: Chosen, frame: FramePyramid, found: Followed | None, start: Transform) -> Followed | None:
+    """What was found by way of the coarsest level, or without it, which may lead astray where the start was right."""
+    if found is not None and chosen.shift(frame, start, found.cam_from_object) < _FAR_PX:
+        return found
+    direct = _followed(chosen, frame, start)
+    if found is None or direct is None:
+        return found or direct
+    return direct if direct.found.sum() > found.found.sum() else found
+
+
+def _followed(chosen: Chosen, frame: FramePyramid, pose: Transform) -> Followed | None:
     """From level to level, until the frame, which may be blurred, shows no more."""
     last: tuple[PoseFit, Found, Flags, int] | None = None
-    pose = coarse.cam_from_object
     for level in range(LEVELS - 2, -1, -1):
         found = chosen.found(frame, pose, level, COARSE_POINTS * 3 // 2 if level else None)
         fit, agreeing = _refitted(found, frame, pose, level)

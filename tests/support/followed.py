@@ -25,9 +25,17 @@ def the_scene() -> AnalyticScene:
 
 
 def photograph(pose: np.ndarray, lens: Camera = LENS) -> np.ndarray:
-    """Grey values (h, w) uint8 of what a camera sees at that cam_from_object."""
-    rgb = the_scene().render_rays(*rays(lens, pose)).rgb.reshape(lens.height, lens.width, 3)
-    return cv2.cvtColor(np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+    """Grey values (h, w) uint8, read-only, of what a camera sees at that cam_from_object."""
+    return _photograph(pose.astype(np.float64).tobytes(), lens)
+
+
+@cache
+def _photograph(pose: bytes, lens: Camera) -> np.ndarray:
+    through_pixels = rays(lens, np.frombuffer(pose).reshape(4, 4))
+    rgb = the_scene().render_rays(*through_pixels).rgb.reshape(lens.height, lens.width, 3)
+    grey = cv2.cvtColor(np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+    grey.setflags(write=False)
+    return grey
 
 
 def pyramid_of(grey: np.ndarray, lens: Camera = LENS) -> FramePyramid:
@@ -37,12 +45,12 @@ def pyramid_of(grey: np.ndarray, lens: Camera = LENS) -> FramePyramid:
 
 @cache
 def _rendered(pose: bytes) -> RenderedView:
-    return the_scene().render_view(VIEW, np.frombuffer(pose).reshape(4, 4).copy())
+    return the_scene().render_view(VIEW, np.frombuffer(pose).reshape(4, 4))
 
 
 def grey_and_depth(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """What a view at that cam_from_object shows, each (h, w)."""
-    view = _rendered(np.ascontiguousarray(pose, np.float64).tobytes())
+    view = _rendered(pose.astype(np.float64).tobytes())
     return cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), view.depth
 
 

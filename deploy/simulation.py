@@ -110,7 +110,7 @@ class Simulation:
 def _frames(config: CameraConfig) -> Iterator[tuple[int, Topic[Any], Message]]:
     """Messages of a source, each with the time at which it is sent: that of its capture, and never before the last."""
     now_ns = first_ns = None
-    for frame in open_source(config, ()).frames(0):
+    for frame in itertools.islice(open_source(config, ()).frames(0), config.frames):
         at_ns = frame.at_ns or 0
         first_ns = at_ns if first_ns is None else first_ns
         capture_ns = _BEGINS_NS + at_ns - first_ns

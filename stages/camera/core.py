@@ -99,10 +99,11 @@ class Feed:
             self._note_sent(frame, now_ns)
             yield frame, capture_ns
 
-    def wait_s(self, now_ns: int) -> float:
-        """How long until the next frame is due; 0 where that is not known beforehand."""
-        frame = self._peek() if self._pace == "live" and self._clock != "wall" and self._start is not None else None
-        return 0.0 if frame is None else max(self._capture_ns(frame, now_ns) - now_ns, 0) * 1e-9
+    def wait_s(self, now_ns: int) -> float | None:
+        """How long until the next frame is due; None where that is not known (yet)."""
+        if self._next is None or self._pace != "live" or self._clock == "wall" or self._start is None:
+            return None
+        return max(self._capture_ns(self._next, now_ns) - now_ns, 0) * 1e-9
 
     def sign_of_life(self, frame_id: int, now_ns: int) -> None:
         """A pass over that frame has come back."""

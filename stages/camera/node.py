@@ -47,7 +47,8 @@ class CameraNode:
 
     def tick_in_s(self, now_ns: int) -> float:
         """A frame goes out when it is due, not at the next beat after that."""
-        return self._opened.wait_s(now_ns) or TICK_S
+        wait_s = self._opened.wait_s(now_ns)
+        return TICK_S if wait_s is None else wait_s
 
     def tick(self, now_ns: int) -> Iterator[Output]:
         yield from self._opened.messages(now_ns)

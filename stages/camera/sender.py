@@ -34,9 +34,9 @@ class Sender:
         except (FieldposeError, OSError) as error:
             self._error = error if isinstance(error, FieldposeError) else SourceError(str(error))
 
-    def wait_s(self, now_ns: int) -> float:
-        """How long until the next frame is due."""
-        return 0.0 if self._error is not None else self._feed.wait_s(now_ns)
+    def wait_s(self, now_ns: int) -> float | None:
+        """How long until the next frame is due; None where that is not known."""
+        return self._feed.wait_s(now_ns)
 
     def heard(self, message: Message, now_ns: int) -> None:
         """Take in a State, Pose or Failure: a frame is answered, or a pass over it has come back."""

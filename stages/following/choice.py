@@ -43,14 +43,17 @@ class Chosen:
     def __len__(self) -> int:
         return sum(len(index) for _, index in self.parts)
 
-    def found(self, frame: FramePyramid, pose: Transform, level: int, most: int | None = None) -> Found:
-        """Look for the points, or `most` of them, near where a pose puts them; patches are 2^level pixels coarse."""
-        share = 1.0 if most is None else min(1.0, most / max(len(self), 1))
+    def limited(self, most: int) -> Chosen:
+        """About so many of the points, of each view its share."""
+        share = min(1.0, most / max(len(self), 1))
+        return Chosen([(view, index[: int(np.ceil(share * len(index)))]) for view, index in self.parts])
+
+    def found(self, frame: FramePyramid, pose: Transform, level: int) -> Found:
+        """Look for the points near where a pose puts them; patches are 2^level pixels coarse."""
         results = []
         for view, index in self.parts:
             at = warped(view, frame, pose)
-            wanted = index[: int(np.ceil(share * len(index)))]
-            results.append((view, at, place(view, frame, at, level, wanted[at.seen[wanted]])))
+            results.append((view, at, place(view, frame, at, level, index[at.seen[index]])))
         return _gathered(results, frame)
 
     def in_frame(self, frame: FramePyramid, pose: Transform) -> tuple[Pixels64, Points64]:

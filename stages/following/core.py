@@ -141,7 +141,7 @@ def difference(view: ViewPoints, cam_from_object: Transform) -> float:
 def _first_fit(chosen: Chosen, frame: FramePyramid, pose: Transform) -> PoseFit | None:
     """The pose at the coarsest level, where most points are shifted alike however far the pose is off."""
     level = LEVELS - 1
-    found = chosen.found(frame, pose, level, COARSE_POINTS)
+    found = chosen.limited(COARSE_POINTS).found(frame, pose, level)
     if len(found) < LEAST_FOUND:
         return None
     shift = found.pixels - found.expected
@@ -174,18 +174,23 @@ def _better(chosen: Chosen, frame: FramePyramid, found: Followed | None, start: 
 
 def _followed(chosen: Chosen, frame: FramePyramid, pose: Transform) -> Followed | None:
     """From level to level, until the frame, which may be blurred, shows no more."""
-    last: tuple[PoseFit, Found, Flags, int] | None = None
+    last: tuple[Chosen, PoseFit, Found, Flags, int] | None = None
     for level in range(LEVELS - 2, -1, -1):
-        found = chosen.found(frame, pose, level, COARSE_POINTS * 3 // 2 if level else None)
+        wanted = chosen.limited(COARSE_POINTS * 3 // 2) if level else chosen
+        found = wanted.found(frame, pose, level)
         fit, agreeing = _refitted(found, frame, pose, level)
-        if fit is None or (last is not None and len(fit.pixels) < _BLURRED * len(last[0].pixels)):
+        if fit is None or (last is not None and _share(wanted, fit) < _BLURRED * _share(*last[:2])):
             break
-        last, pose = (fit, found, agreeing, level), fit.cam_from_object
-    return None if last is None else _described(chosen, frame, *last)
+        last, pose = (wanted, fit, found, agreeing, level), fit.cam_from_object
+    return None if last is None else _described(frame, *last)
+
+
+def _share(chosen: Chosen, fit: PoseFit) -> float:
+    return len(fit.pixels) / max(len(chosen), 1)
 
 
 def _described(
-    chosen: Chosen, frame: FramePyramid, fit: PoseFit, found: Found, agreeing: Flags, level: int
+    frame: FramePyramid, chosen: Chosen, fit: PoseFit, found: Found, agreeing: Flags, level: int
 ) -> Followed:  # fmt: skip
     pose, longer_side = fit.cam_from_object, max(frame.camera.width, frame.camera.height)
     pixels, points = chosen.in_frame(frame, pose)

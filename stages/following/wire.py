@@ -42,7 +42,9 @@ def _grey(frame: Frame, longer_side: int) -> np.ndarray | None:
     camera, image = frame.camera, np.asarray(frame.image)
     if frame.encoding == "rgb8":
         return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
-    fitting = (by for by in _REDUCED if max(camera.width, camera.height) >= by * longer_side)
+    # A reduced image of another size would cover more than the frame does.
+    sizes = camera.width, camera.height
+    fitting = (by for by in _REDUCED if max(sizes) >= by * longer_side and all(size % by == 0 for size in sizes))
     by = next(fitting, 1) if frame.encoding == "jpeg" else 1
     flag = _REDUCED.get(by, cv2.IMREAD_GRAYSCALE)
     try:

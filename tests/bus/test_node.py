@@ -14,8 +14,9 @@ from typing import Any
 import pytest
 from support.bus_samples import ADDRESS, camera_info, frame, guess, matches, prior, view
 
+from fieldpose.bus import node
 from fieldpose.bus.messages import Failure, Matches, Message, Reason, Stats
-from fieldpose.bus.node import EndOfInput, Handler, Joined, JoinedHandler, Output, run_node
+from fieldpose.bus.node import EndOfInput, Handler, Joined, JoinedHandler, KeepsTime, Output, run_node
 from fieldpose.bus.ports import Inbox, Outbox, Received
 from fieldpose.bus.topics import CAMERA_INFO, FAILURE, FRAME, GUESS, MATCHES, PRIOR, STATS, TRUTH, VIEW, Topic
 from fieldpose.bus.transport import MemoryBus, ZenohBus, wait_for
@@ -437,6 +438,45 @@ class TestPlain:
         assert all(item.topic is STATS for item in items)
         assert isinstance(items[-1].message, Stats)
         assert items[-1].message.failed == 1
+
+
+class Beating(Plain):
+    """Wants to be called again after so long, and tells once it has been called five times."""
+
+    def __init__(self, tick_in_s: float) -> None:
+        super().__init__(tick=self.counted)
+        self.wanted_s, self.ticks, self.five = tick_in_s, 0, threading.Event()
+
+    def counted(self, now_ns: int) -> Iterable[Output]:
+        self.ticks += 1
+        if self.ticks == 5:
+            self.five.set()
+        return ()
+
+    def tick_in_s(self, now_ns: int) -> float:
+        return self.wanted_s
+
+
+class TestKeepsTime:
+    def test_a_handler_that_says_when_it_is_due_is_called_sooner_than_others(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(node, "TICK_S", 3600.0)
+        handler, ticks = Beating(0.001), []
+        with running(handler, MemoryBus()):
+            assert handler.five.wait(10.0)
+        with running(Plain(tick=lambda now_ns: ticks.append(now_ns) or ()), MemoryBus()):
+            assert not threading.Event().wait(0.1)
+        assert len(ticks) == 1
+
+    def test_none_is_called_later_than_others_are(self) -> None:
+        handler = Beating(3600.0)
+        with running(handler, MemoryBus()):
+            assert handler.five.wait(10.0)
+
+    def test_only_handlers_that_can_say_it_are_asked(self) -> None:
+        assert isinstance(Beating(0.0), KeepsTime)
+        assert not isinstance(Plain(), KeepsTime)
 
 
 class TestStats:

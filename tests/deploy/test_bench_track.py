@@ -161,7 +161,7 @@ def test_tracking_is_measured_in_processes_and_in_one(tmp_path: Path, capsys: py
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--ablations", "half"], "expected one of default, full"),
+        (["--ablations", "half"], "expected one of default, following off"),
         (["--frames", "0"], "at least 1"),
         (["--cores", "100000"], "this machine has"),
         (["--sequences", "what"], "or a recording"),

@@ -55,6 +55,38 @@ def test_every_other_frame_goes_at_its_own_time_and_a_second_start_goes_on_there
     assert [frame_id for frame_id, _ in sent(feed("none", every=2, first=1, pace="fast"), 0)] == [2, 4]
 
 
+def test_how_long_it_is_until_the_next_live_frame_is_known_once_the_first_is_sent() -> None:
+    live = feed("own")
+    assert live.wait_s(START) == 0
+    assert sent(live, 0) == [(0, 0)]
+    assert live.wait_s(START) == pytest.approx(0.033)
+    assert live.wait_s(START + 30 * MS) == pytest.approx(0.003)
+    assert live.wait_s(START + 40 * MS) == 0
+    assert sent(live, 40) == [(1, 33)]
+    assert live.wait_s(START + 40 * MS) == pytest.approx(0.027)
+    assert sent(live, 1000) == [(2, 67), (3, 200), (4, 233)]
+    assert live.wait_s(START + 1000 * MS) == 0
+
+
+def test_a_frame_that_is_waited_for_is_sent_when_it_is_due_and_once() -> None:
+    live, now_ms, ids = feed("own"), 0.0, []
+    for _ in range(5):
+        ids += [frame_id for frame_id, _ in sent(live, now_ms)]
+        now_ms += live.wait_s(START + round(now_ms * MS)) * 1e3
+    assert ids == [0, 1, 2, 3, 4]
+    assert now_ms == pytest.approx(233)
+
+
+@pytest.mark.parametrize(
+    ("clock", "pace"), [("none", "lockstep"), ("none", "fast"), ("own", "fast"), ("own", "lockstep"), ("wall", "live")]
+)
+def test_where_frames_do_not_wait_for_their_time_there_is_none_to_wait(clock: Clock, pace: str) -> None:
+    other = feed(clock, pace=pace)
+    for now_ms in (0, 1, 500):
+        sent(other, now_ms)
+        assert other.wait_s(START + now_ms * MS) is None
+
+
 def test_a_rate_replaces_the_times() -> None:
     assert [sent(feed_, 0) + sent(feed_, 99) + sent(feed_, 100) for feed_ in [feed("own", rate_hz=10)]] == [
         [(0, 0), (1, 100)]

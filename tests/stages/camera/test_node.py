@@ -20,7 +20,7 @@ from fieldpose.bus.messages import (
     TrackingState,
     Truth,
 )
-from fieldpose.bus.node import EndOfInput, first_header
+from fieldpose.bus.node import TICK_S, EndOfInput, KeepsTime, first_header
 from fieldpose.bus.topics import CAMERA_INFO, FAILURE, FRAME, STATE, TRUTH
 from fieldpose.errors import SourceError
 from fieldpose.stages.camera.config import CameraConfig
@@ -162,6 +162,26 @@ def test_a_failure_is_a_sign_of_life_but_no_answer(folder: Path, monkeypatch: py
     assert list(node.handle(FAILURE, failure)) == []
     assert sent(node, now_ns=second + second // 4) == []
     assert [frame.header.frame_id for frame in sent(node, now_ns=2 * second)] == [1]
+
+
+def test_it_asks_to_be_called_when_the_next_frame_is_due(folder: Path) -> None:
+    """And every 20 ms where it is not known when that is."""
+    node, start_ns, ms = started(folder, pace="live", rate_hz=10), 10**18, 1_000_000
+    assert isinstance(node, KeepsTime)
+    assert node.tick_in_s(start_ns) == TICK_S
+    assert [frame.header.frame_id for frame in sent(node, start_ns)] == [0]
+    assert node.tick_in_s(start_ns) == pytest.approx(0.1)
+    assert node.tick_in_s(start_ns + 97 * ms) == pytest.approx(0.003)
+    assert sent(node, start_ns + 99 * ms) == []
+    assert [frame.header.frame_id for frame in sent(node, start_ns + 100 * ms)] == [1]
+    assert [frame.header.frame_id for frame in sent(node, start_ns + 200 * ms)] == [2]
+    assert node.tick_in_s(start_ns + 200 * ms) == TICK_S
+
+
+def test_photos_that_wait_for_answers_are_looked_after_every_20_ms(folder: Path) -> None:
+    node = started(folder)
+    assert len(sent(node)) == 1
+    assert node.tick_in_s(10**18) == TICK_S
 
 
 def test_a_camera_that_died_goes_on_with_the_next_frame(folder: Path, tmp_path: Path) -> None:

@@ -33,3 +33,14 @@ def test_the_newest_are_kept_and_those_given_stay() -> None:
     assert known == list(range(1000 - len(known), 1000))
     assert 64 <= len(known) < 1000
     assert priors.take(0) is given
+
+
+def test_looking_at_a_prior_leaves_it_for_its_frame() -> None:
+    priors = Priors(given={3: (given := on_sphere(0, 0))})
+    assert priors.peek(4) is None
+    assert priors.peek(3) is given
+    priors.add(3, pose := on_sphere(1, 0))
+    assert priors.peek(3) is pose
+    assert priors.peek(3) is pose
+    assert priors.take(3) is pose
+    assert priors.peek(3) is given

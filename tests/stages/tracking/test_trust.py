@@ -43,6 +43,28 @@ def test_a_good_pose_takes_all_strikes_back() -> None:
     assert trust.state is TrackingState.LIMITED
 
 
+@pytest.mark.parametrize("strikes", [0, 2])
+def test_what_turns_out_to_be_wrong_is_lost_at_once(strikes: int) -> None:
+    trust = tracking()
+    for _ in range(strikes):
+        trust.rejected()
+    before = trust.epoch
+    trust.lost()
+    assert (trust.state, trust.tracked, trust.epoch) == (TrackingState.LOST, False, before + 1)
+    trust.lost()
+    assert trust.epoch == before + 1
+    trust.good()
+    assert (trust.state, trust.epoch) == (TrackingState.TRACKING, before + 2)
+    trust.rejected()
+    assert trust.state is TrackingState.LIMITED
+
+
+def test_where_nothing_is_tracked_nothing_can_be_lost() -> None:
+    trust = Trust(4, 12, 3)
+    trust.lost()
+    assert (trust.state, trust.epoch) == (TrackingState.INITIALIZING, 0)
+
+
 def test_weak_poses_do_not_end_tracking_at_once_nor_restore_it() -> None:
     trust, states = tracking(), []
     for _ in range(12):

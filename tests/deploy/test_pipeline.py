@@ -37,7 +37,7 @@ def descendants() -> set[int]:
 def pid_of(stage: str) -> int:
     """The process of a stage below this one."""
     for process in psutil.Process().children(recursive=True):
-        words = process.cmdline()
+        words = " ".join(process.cmdline()).split()
         if "stage" in words and words[words.index("stage") + 1] == stage:
             return process.pid
     raise AssertionError(f"{stage} is not running")

@@ -8,11 +8,14 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import NoReturn
 
 import psutil
 from setproctitle import setproctitle
+
+from fieldpose.deploy.processes.lifeline import die_with_parent
 
 FIELDPOSE = (sys.executable, "-P", "-m", "fieldpose")
 """How a command line of ours begins; the rest are the arguments of `fieldpose`."""
@@ -24,9 +27,35 @@ def can_fork() -> bool:
     return sys.platform.startswith("linux") and psutil.Process().num_threads() == 1
 
 
+@contextmanager
+def beside(*works: Callable[[], object]) -> Iterator[None]:
+    """Have each of these done in a fork of this process that ends with it, while the context lasts, and wait for them.
+
+    Only what they leave in files stays, and what goes wrong in them is lost. Nothing is done where this process cannot
+    be forked.
+    """
+    pids = [_started(work) for work in works] if can_fork() else []
+    try:
+        yield
+    finally:
+        for pid in pids:
+            os.waitpid(pid, 0)
+
+
+def _started(work: Callable[[], object]) -> int:
+    pid = os.fork()
+    if pid == 0:
+        try:
+            die_with_parent()
+            work()
+        finally:
+            os._exit(0)
+    return pid
+
+
 def become(arguments: Sequence[str], environment: Mapping[str, str]) -> NoReturn:
     """In a process just forked: be `fieldpose` with these arguments, and end with its exit code."""
-    # What was inherited is never collected: that would write to, and so copy, every page that is shared.
+    # Nothing that was inherited is collected: pages that are shared would be written to, and files of others closed.
     gc.freeze()
     for name in _CAUGHT:
         signal.signal(getattr(signal, name), signal.SIG_DFL)

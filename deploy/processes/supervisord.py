@@ -6,6 +6,7 @@ each `fieldpose …` is a fork of this process; other commands, and all where fo
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
 import sys
@@ -39,14 +40,22 @@ def main(config: str, prepare: Sequence[str]) -> None:
     os.environ.pop(PARENT, None)
     options = ForkingOptions()
     if prepare:
-        module, name = prepare[0].split(":")
-        getattr(importlib.import_module(module), name)(*prepare[1:])
+        _call(*prepare)
         options.forks = can_fork()
     options.realize(["-c", config], doc=supervisord.__doc__)
     options.first, options.test = True, False
     supervisord.go(options)
     options.close_httpservers()
     options.close_logger()
+
+
+def _call(function: str, *arguments: str) -> None:
+    """Call a function, and leave what it makes alone for ever: looking for garbage takes as long as many an import."""
+    gc.disable()
+    module, name = function.split(":")
+    getattr(importlib.import_module(module), name)(*arguments)
+    gc.freeze()
+    gc.enable()
 
 
 if __name__ == "__main__":

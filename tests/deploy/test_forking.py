@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -21,6 +22,15 @@ from fieldpose.deploy.processes.supervision import Program, Supervisor
 from fieldpose.errors import ProcessError
 
 STAGES_ALONE = ("importlib:import_module", "fieldpose.deploy.commands.stage")
+BESIDE = """
+import sys
+from pathlib import Path
+from fieldpose.deploy.processes.forking import beside
+done = Path(sys.argv[1])
+with beside(done.touch, lambda: 1 / 0):
+    inside = 1
+print(inside, done.exists())
+"""
 SLEEP = "import time; time.sleep(60)"
 
 
@@ -71,6 +81,12 @@ def test_a_users_mistake_ends_a_forked_stage_with_its_line(tmp_path: Path) -> No
         until(lambda: supervisor.poll().get("pnp") and supervisor.poll()["pnp"].given_up)
         with pytest.raises(ProcessError, match=r"^pnp: .*--colour"):
             supervisor.check(restart_limit=2)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="forks on Linux alone")
+def test_work_beside_is_waited_for_and_its_failure_is_its_own(tmp_path: Path) -> None:
+    said = subprocess.run([sys.executable, "-c", BESIDE, tmp_path / "done"], capture_output=True, text=True, timeout=60)
+    assert (said.stdout, said.stderr) == ("1 True\n", "")
 
 
 def test_other_commands_are_executed(tmp_path: Path) -> None:

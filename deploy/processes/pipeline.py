@@ -225,7 +225,7 @@ def _check_recording(path: Path | None) -> None:
 
 
 def _recording(path: Path | None, supervisor: Supervisor) -> RecordingInfo | None:
-    if path is None:
+    if path is None or not supervisor.has_run(RECORDER):
         return None
     if partial_path(path).exists() or not path.exists():
         raise RecordingError(f"{path}: the recording was not finished: {supervisor.last_line(RECORDER)}")

@@ -129,6 +129,10 @@ class Supervisor:
             self._pids[name] = info.pid or before
         return infos
 
+    def has_run(self, name: str) -> bool:
+        """Whether a process has been started, as far as `poll` has told."""
+        return self._pids.get(name, 0) > 0
+
     def check(self, restart_limit: int) -> dict[str, ProcessInfo]:
         """`poll`, raising ProcessError with the last line of its log for a process that does not stay up."""
         infos = self.poll()

@@ -69,6 +69,7 @@ def test_a_stage_that_is_killed_is_forked_again_and_ends_when_it_is_asked_to(
         os.kill(first, signal.SIGKILL)
         until(lambda: supervisor.poll() and supervisor.restarts == {"pnp": 1})
         wait_for(bus, Address(), ["pnp"], 60.0)
+        assert supervisor.has_run("pnp")
         pids = [info.pid for info in supervisor.poll().values()]
         assert supervisor.stop(["pnp"], timeout_s=10.0)
         assert supervisor.stop(["hub"], timeout_s=10.0)
@@ -99,6 +100,7 @@ def test_nothing_runs_while_it_is_prepared_and_that_can_be_ended(tmp_path: Path)
     prepare = ("builtins:exec", SLEEP)
     with Supervisor(tmp_path, [Program("a", [sys.executable, "-c", SLEEP])], prepare) as supervisor:
         assert supervisor.poll() == supervisor.check(restart_limit=0) == {}
+        assert not supervisor.has_run("a")
         (daemon,) = [child for child in psutil.Process().children() if str(tmp_path) in " ".join(child.cmdline())]
     assert not daemon.is_running()
 

@@ -142,3 +142,29 @@ def test_ctrl_c_ends_every_process_within_5_s_and_leaves_a_finished_recording(tm
     assert {"frame", "truth", "state"} <= {topic.topic for topic in held.topics if topic.messages}
     assert [path.name for path in tmp_path.glob("*.partial")] == []
     assert json.loads(figures.read_text())["frames_sent"] > 0
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_kernels_are_compiled_ends_every_process_and_leaves_no_recording(tmp_path: Path) -> None:
+    source, caches = f"mcap:{demo_file('sequence.mcap')}", tmp_path / "caches"
+    arguments = ["--source", source, "--record", str(tmp_path / "run.mcap"), "--json", str(tmp_path / "run.json")]
+    running = subprocess.Popen(
+        command("run", demo_file("field.safetensors"), *arguments),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "NUMBA_CACHE_DIR": str(caches)},
+    )
+    assert running.stderr is not None
+    for line in running.stderr:
+        if line.endswith("starting\n"):
+            break
+    processes = psutil.Process(running.pid).children(recursive=True)
+    assert processes
+    running.send_signal(signal.SIGINT)
+    assert running.wait(timeout=20) == 130
+    assert running.stderr.read() == f"{source}: finishing\n"
+    running.stderr.close()
+    _, alive = psutil.wait_procs(processes, timeout=10)
+    assert all(process.status() == psutil.STATUS_ZOMBIE for process in alive)
+    assert not list(tmp_path.glob("*.mcap*"))

@@ -28,7 +28,8 @@ __all__ = [
 
 LOCAL_HUB = "tcp/127.0.0.1:7447"
 _LOCAL_PEER = "tcp/127.0.0.1:0"
-_POOL_BYTES = 128 << 20
+_POOL_BYTES = 32 << 20
+"""A sender comes to use all of it before it uses any again; room for five full-HD images as pixels."""
 _ENDPOINT = re.compile(r"[a-z]+/.+:\d{1,5}([?#].*)?")
 _PRIORITIES = {"data": zenoh.Priority.DATA, "data_low": zenoh.Priority.DATA_LOW}
 # A message waits this long for a receiver that is busy for a moment; while one takes nothing at all, what is meant

@@ -76,7 +76,7 @@ class Parts:
 
         config = self.settings.refinement
         renderer = make_renderer(self.field, self._threads, self.settings.backend)
-        warm_up(renderer, jacobian=self._together and config.on and config.derivative == "field")
+        warm_up(renderer, jacobian=config.needs_jacobian)
         return renderer
 
     @cached_property

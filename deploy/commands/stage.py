@@ -25,13 +25,14 @@ from fieldpose.deploy.graph import (
     Launch,
     Process,
     rows_of,
-    thread_environment,
     threads_of,
 )  # fmt: skip
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan, resolve
 from fieldpose.deploy.processes.endpoints import peer_address
 from fieldpose.deploy.processes.lifeline import die_with_parent
+from fieldpose.deploy.processes.preload import field_of
+from fieldpose.deploy.processes.threads import hold_to
 from fieldpose.deploy.processes.warmup import compile_kernels
 from fieldpose.deploy.settings import Settings
 
@@ -99,12 +100,12 @@ class Options:
 def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handler]) -> None:
     plan, field = planned(options, row)
     threads = options.threads or threads_of(row, plan.in_flight)
-    os.environ.update(thread_environment(threads))
+    hold_to(threads)
     parts = Parts(plan, threads)
     if field is not None:
         parts.field = field
     if options.field is not None and row.renders and plan.settings.backend == "numba":
-        compile_kernels(options.field, row.name)
+        compile_kernels(options.field, plan.settings.refinement.needs_jacobian)
     address = options.settings.address
     # In whatever order they are started, the first frame finds all that work on it.
     passed = tuple(other.name for other in rows_of(plan, recorded=False) if other.name in AT_WORK)
@@ -139,10 +140,9 @@ def planned(options: Options, row: Process) -> tuple[Plan, Field | None]:
     settings, path = options.settings, options.field
     if path is None or not _plans_by_field(options, row):
         return resolve(settings, None, path), None
-    from fieldpose.stages.nerf.field import load_field
     from fieldpose.stages.nerf.training_views import training_views
 
-    field = load_field(path)
+    field = field_of(path)
     return resolve(settings, training_views(field), path), field
 
 

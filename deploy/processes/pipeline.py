@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -32,6 +31,7 @@ from fieldpose.deploy.graph import (
 from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.processes.collector import Collector
 from fieldpose.deploy.processes.endpoints import check_free, free_port, peer_address
+from fieldpose.deploy.processes.forking import FIELDPOSE
 from fieldpose.deploy.processes.supervision import Program, Supervisor
 from fieldpose.deploy.reporting.results import RunResult
 from fieldpose.deploy.settings import to_json
@@ -42,6 +42,7 @@ _START_S = 300.0
 _RESTARTS_AT_START, _RESTARTS = 2, 10
 _POLL_S = 0.1
 _SETTLE_S = 0.2
+_SETTINGS = "settings.json"
 _STAGES_STOP_S, _RECORDER_STOP_S, _HUB_STOP_S = 2.0, 2.0, 0.5
 """Together under the 5 s after a Ctrl-C."""
 _RECORDER_FINISHES_S = 60.0
@@ -88,7 +89,7 @@ def run_pipeline(run: Run, report: Report = lambda progress: None) -> RunResult:
     check_free(run.listen)
     with StopSignals() as signals, _folder(run.logs) as folder:
         hub = run.listen or f"tcp/127.0.0.1:{free_port()}"
-        with Supervisor(folder, programs(run, folder, hub)) as supervisor:
+        with Supervisor(folder, programs(run, folder, hub), preloading(run, folder)) as supervisor:
             return _Running(run, supervisor, hub, signals, report).run()
 
 
@@ -97,7 +98,7 @@ def programs(run: Run, folder: Path, hub: str) -> list[Program]:
     progress_file = folder / "camera-progress.json"
     progress_file.unlink(missing_ok=True)
     settings = run.plan.settings
-    config = folder / "settings.json"
+    config = folder / _SETTINGS
     config.write_bytes(to_json(replace(settings, camera=replace(settings.camera, progress_file=progress_file))))
     listeners = (OBSERVER, RECORDER) if run.record is not None else (OBSERVER,)
     everyone = (*listeners, *(name for name in run.processes if name in STAGES and name != CAMERA))
@@ -105,7 +106,7 @@ def programs(run: Run, folder: Path, hub: str) -> list[Program]:
     for name in run.processes:
         row = BY_NAME[name]
         threads = threads_of(row, run.plan.in_flight)
-        command = [sys.executable, "-P", "-m", "fieldpose", "stage", name, "--connect", hub, "--config", str(config)]
+        command = [*FIELDPOSE, "stage", name, "--connect", hub, "--config", str(config)]
         if run.plan.field is not None:
             command += ["--field", str(run.plan.field.resolve())]
         command += ["--threads", str(threads)]
@@ -115,6 +116,12 @@ def programs(run: Run, folder: Path, hub: str) -> list[Program]:
             command += ["--wait-for", *(everyone if name == CAMERA else listeners)]
         programs.append(Program(name, command, thread_environment(threads), row.stop_s, ends=name == CAMERA))
     return programs
+
+
+def preloading(run: Run, folder: Path) -> tuple[str, ...]:
+    """What is called before any process of a run is started, so that all of them share what it loads."""
+    field = "" if run.plan.field is None else str(run.plan.field.resolve())
+    return ("fieldpose.deploy.processes.preload:preload", str(folder / _SETTINGS), field, *run.processes)
 
 
 class _Running:
@@ -223,7 +230,7 @@ def _check_recording(path: Path | None) -> None:
 
 
 def _recording(path: Path | None, supervisor: Supervisor) -> RecordingInfo | None:
-    if path is None:
+    if path is None or not supervisor.has_run(RECORDER):
         return None
     if partial_path(path).exists() or not path.exists():
         raise RecordingError(f"{path}: the recording was not finished: {supervisor.last_line(RECORDER)}")

@@ -10,6 +10,7 @@ import sys
 import time
 import xmlrpc.client
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from http.client import HTTPException
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any
 
 from supervisor.xmlrpc import SupervisorTransport
 
+from fieldpose.deploy.graph import thread_environment
 from fieldpose.deploy.processes.lifeline import PARENT
 from fieldpose.errors import ProcessError
 
@@ -27,6 +29,7 @@ _LONGEST_SOCKET_PATH = 100
 _ANSWER_S = 10.0
 _END_S = 2.0
 _POLL_S = 0.02
+_SUPERVISORD = (sys.executable, "-P", "-m", "fieldpose.deploy.processes.supervisord")
 _RESTING = ("STOPPED", "EXITED", "FATAL")
 
 
@@ -66,15 +69,18 @@ class ProcessInfo:
 class Supervisor:
     """Runs programs while the context lasts; `folder` gets the configuration, a socket, and a log of each.
 
+    prepare: a function as "module:name" and its arguments, called by supervisord before it starts anything; programs
+    that begin with `forking.FIELDPOSE` are then forked from it.
+
     A program that ends with USER_ERROR stays down, and so does one that has done its work; any other end brings it
     back. All of them end with this process, even if it is killed. Raises ProcessError where supervisord does not
     come up.
     """
 
-    def __init__(self, folder: Path, programs: Sequence[Program]) -> None:
+    def __init__(self, folder: Path, programs: Sequence[Program], prepare: Sequence[str] = ()) -> None:
         self.restarts: dict[str, int] = {}
         self._folder = folder = folder.resolve()
-        self._programs = programs
+        self._programs, self._prepare, self._answered = programs, prepare, False
         self._socket = folder / "supervisor.sock"
         self._pids: dict[str, int] = {}
         self._daemon: subprocess.Popen[bytes] | None = None
@@ -88,20 +94,18 @@ class Supervisor:
         config.write_text(configuration(self._programs), encoding="utf-8")
         with (self._folder / "supervisord.out").open("wb") as output:
             self._daemon = subprocess.Popen(
-                [sys.executable, "-P", "-m", "fieldpose.deploy.processes.supervisord", "-c", str(config)],
+                [*_SUPERVISORD, str(config), *self._prepare],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 cwd=self._folder,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, PARENT: str(os.getpid())},
+                # The libraries that it imports are to start no threads.
+                env={**os.environ, **thread_environment(1), PARENT: str(os.getpid())},
                 # A Ctrl-C at the terminal is for the command, which then stops the processes in order.
                 start_new_session=True,
             )
-        try:
-            self._wait_for_answer(self._daemon)
-        except BaseException:
-            self._end_daemon(nothing_left=False)
-            raise
+        if not self._prepare:
+            self._wait_for_answer()
         return self
 
     def __exit__(
@@ -111,7 +115,9 @@ class Supervisor:
         self._end_daemon(nothing_left=ended)
 
     def poll(self) -> dict[str, ProcessInfo]:
-        """The state of each process now; also counts who came back since the last time."""
+        """The state of each process now, of none while they are prepared; also counts who came back since."""
+        if not self._answers():
+            return {}
         infos = {
             entry["name"]: ProcessInfo(entry["statename"], entry["pid"], entry["exitstatus"])
             for entry in self._call(self._rpc.getAllProcessInfo) or ()
@@ -122,6 +128,10 @@ class Supervisor:
                 self.restarts[name] = self.restarts.get(name, 0) + 1
             self._pids[name] = info.pid or before
         return infos
+
+    def has_run(self, name: str) -> bool:
+        """Whether a process has been started, as far as `poll` has told."""
+        return self._pids.get(name, 0) > 0
 
     def check(self, restart_limit: int) -> dict[str, ProcessInfo]:
         """`poll`, raising ProcessError with the last line of its log for a process that does not stay up."""
@@ -182,16 +192,26 @@ class Supervisor:
             self._transport.close()  # it would go on with a broken connection
             raise ProcessError(f"the supervisor of the processes does not answer: {error}") from error
 
-    def _wait_for_answer(self, daemon: subprocess.Popen[bytes]) -> None:
+    def _wait_for_answer(self) -> None:
         deadline = time.monotonic() + _ANSWER_S
-        while True:
-            try:
-                self.poll()
-                return
-            except ProcessError:
-                if daemon.poll() is not None or time.monotonic() > deadline:
-                    raise ProcessError(f"supervisord cannot start: {self._last_words()}") from None
-            time.sleep(_POLL_S)
+        try:
+            while not self._answers():
+                if time.monotonic() > deadline:
+                    raise ProcessError(f"supervisord cannot start: {self._last_words()}")
+                time.sleep(_POLL_S)
+        except BaseException:
+            self._end_daemon(nothing_left=False)
+            raise
+
+    def _answers(self) -> bool:
+        """Whether supervisord has come up: not while it prepares."""
+        if not self._answered:
+            if self._daemon is None or self._daemon.poll() is not None:
+                raise ProcessError(f"supervisord cannot start: {self._last_words()}")
+            with suppress(ProcessError):
+                self._call(self._rpc.getState)
+                self._answered = True
+        return self._answered
 
     def _last_words(self) -> str:
         text = (self._folder / "supervisord.out").read_text(errors="replace").strip()

@@ -1,16 +1,62 @@
-"""The supervisor of a pipeline's processes as a program: supervisord, except that it ends with its parent."""
+"""The supervisor of a pipeline's processes as a program: supervisord, which ends with its parent and forks the stages.
+
+Imports would take every stage a second or more and 200 MB. Here they are made once, before anything is started, and
+each `fieldpose …` is a fork of this process; other commands, and all where forks are no use, are executed as ever.
+"""
 
 from __future__ import annotations
 
+import gc
+import importlib
 import os
 import sys
+from collections.abc import Mapping, Sequence
 
-from supervisor.supervisord import main
+from setproctitle import setproctitle
+from supervisor import supervisord
+from supervisor.options import ServerOptions
 
+from fieldpose.deploy.processes.forking import FIELDPOSE, become, can_fork
 from fieldpose.deploy.processes.lifeline import PARENT, die_with_parent
 
-if __name__ == "__main__":
+
+class ForkingOptions(ServerOptions):
+    """supervisord's hooks into the operating system; `execve` is called in the process just forked."""
+
+    forks = False
+
+    def execve(self, filename: str, argv: Sequence[str], env: Mapping[str, str]) -> None:
+        if self.forks and tuple(argv[: len(FIELDPOSE)]) == FIELDPOSE:
+            become(argv[len(FIELDPOSE) :], env)
+        super().execve(filename, argv, env)
+
+
+def main(config: str, prepare: Sequence[str]) -> None:
+    """Serve a configuration; `prepare` is a function, as "module:name", and what it is called with before."""
     die_with_parent()
+    # It finds the place of the title only while the environment is as it was.
+    setproctitle(f"fieldpose supervisord -c {config}")
     # For this process alone: its children have another parent.
     os.environ.pop(PARENT, None)
-    main(sys.argv[1:])
+    options = ForkingOptions()
+    if prepare:
+        _call(*prepare)
+        options.forks = can_fork()
+    options.realize(["-c", config], doc=supervisord.__doc__)
+    options.first, options.test = True, False
+    supervisord.go(options)
+    options.close_httpservers()
+    options.close_logger()
+
+
+def _call(function: str, *arguments: str) -> None:
+    """Call a function, and leave what it makes alone for ever: looking for garbage takes as long as many an import."""
+    gc.disable()
+    module, name = function.split(":")
+    getattr(importlib.import_module(module), name)(*arguments)
+    gc.freeze()
+    gc.enable()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2:])

@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 from fieldpose.bus.logs import stage_logger
@@ -15,19 +16,21 @@ from fieldpose.bus.logs import stage_logger
 _WORTH_TELLING_S = 3.0
 
 
-def compile_kernels(field: Path, process: str) -> None:
+@cache
+def compile_kernels(field: Path, jacobian: bool = False) -> None:
     """Have the rendering kernels compiled, or fetched from the cache that processes share.
 
-    Processes take turns, so that the first compiles and the others find the result. Raises FieldFileError.
+    Processes take turns, so that the first compiles and the others find the result; one forked from a process that
+    has done so finds them in its memory. Raises FieldFileError.
     """
     from fieldpose.stages.nerf.loading import load_renderer, warm_up
 
     with one_at_a_time():
         began = time.monotonic()
-        warm_up(load_renderer(field, backend="numba"))
+        warm_up(load_renderer(field, backend="numba"), jacobian)
         seconds = time.monotonic() - began
     if seconds > _WORTH_TELLING_S:
-        stage_logger(process).info("compiled the kernels, for this and the next start", seconds=round(seconds, 1))
+        stage_logger("kernels").info("compiled the kernels, for this and the next start", seconds=round(seconds, 1))
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +14,8 @@ from safetensors.numpy import save
 
 from fieldpose.errors import FieldFileError
 from fieldpose.stages.nerf.config import FieldConfig
-from fieldpose.stages.nerf.kernels.space import BLOCK
-from fieldpose.stages.nerf.kernels.types import SH_SIZE, Domain, Net
+from fieldpose.stages.nerf.kernels.types import BLOCK, SH_SIZE, Domain, Net
 from fieldpose.stages.nerf.metadata import FORMAT_VERSION, FieldMetadata, Space
-from fieldpose.stages.nerf.occupancy import pack
 
 DESCRIPTOR_SIZE = 64
 LEARNT = ("table", "w1", "w2", "c1", "c2", "c3")
@@ -55,6 +54,9 @@ class Field:
 
 def domain_of(space: Space, occupied: np.ndarray) -> Domain:
     """Pack the occupancy for the kernels."""
+    # It brings numba, which no process needs that does not render.
+    from fieldpose.stages.nerf.occupancy import pack
+
     bits, distance = pack(occupied)
     half = np.array(space.half, np.float32)
     return Domain(
@@ -75,24 +77,32 @@ def grid_layout(config: FieldConfig) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 def new_net(config: FieldConfig, rng: np.random.Generator) -> Net:
     """Random parameters: tables near zero, layers scaled by their width (He et al., 2015)."""
-    offsets, resolutions, masks, entries = grid_layout(config)
-    inputs = config.levels * config.level_features
+    shapes = learnt_shapes(config)
 
     def layer(rows: int, columns: int) -> np.ndarray:
         bound = np.sqrt(6 / rows) if columns > 4 else np.sqrt(3 / rows)
         return rng.uniform(-bound, bound, (rows, columns)).astype(np.float32)
 
-    return Net(
-        table=rng.uniform(-1e-4, 1e-4, (entries, config.level_features)).astype(np.float32),
-        w1=layer(inputs, config.hidden),
-        w2=layer(config.hidden, 1 + config.features),
-        c1=layer(config.features + SH_SIZE, config.colour_hidden),
-        c2=layer(config.colour_hidden, config.colour_hidden),
-        c3=layer(config.colour_hidden, 3),
-        offsets=offsets,
-        resolutions=resolutions,
-        masks=masks,
-    )
+    table = rng.uniform(-1e-4, 1e-4, shapes["table"]).astype(np.float32)
+    return net_of(config, {"table": table, **{name: layer(*shapes[name]) for name in LEARNT[1:]}})
+
+
+def learnt_shapes(config: FieldConfig) -> dict[str, tuple[int, int]]:
+    """The shape of each learnt array."""
+    return {
+        "table": (grid_layout(config)[3], config.level_features),
+        "w1": (config.levels * config.level_features, config.hidden),
+        "w2": (config.hidden, 1 + config.features),
+        "c1": (config.features + SH_SIZE, config.colour_hidden),
+        "c2": (config.colour_hidden, config.colour_hidden),
+        "c3": (config.colour_hidden, 3),
+    }
+
+
+def net_of(config: FieldConfig, learnt: Mapping[str, np.ndarray]) -> Net:
+    """Learnt arrays with the layout of their grid."""
+    offsets, resolutions, masks, _ = grid_layout(config)
+    return Net(**learnt, offsets=offsets, resolutions=resolutions, masks=masks)
 
 
 def load_field(path: Path) -> Field:
@@ -117,11 +127,10 @@ def load_field(path: Path) -> Field:
 
 
 def _assemble(arrays: dict[str, np.ndarray], metadata: FieldMetadata) -> Field:
-    config = metadata.config
-    template = new_net(config, np.random.default_rng(0))
+    shapes = learnt_shapes(metadata.config)
     learnt = {name: np.ascontiguousarray(arrays[name], dtype=np.float32) for name in LEARNT}
     for name, array in learnt.items():
-        expected = getattr(template, name).shape
+        expected = shapes[name]
         if array.shape != expected or not np.all(np.isfinite(array)):
             raise ValueError(f"array {name} has shape {array.shape} or values that are not finite, expected {expected}")
     bits = np.unpackbits(arrays["occupied"], bitorder="little").astype(bool)
@@ -129,7 +138,7 @@ def _assemble(arrays: dict[str, np.ndarray], metadata: FieldMetadata) -> Field:
     if n % BLOCK or n**3 != len(bits):
         raise ValueError(f"array occupied has {len(bits)} bits, expected a cube of cells, in blocks of {BLOCK}")
     occupied = bits.reshape(n, n, n)
-    return Field(metadata, template._replace(**learnt), occupied, _descriptors(arrays, len(metadata.cameras)))
+    return Field(metadata, net_of(metadata.config, learnt), occupied, _descriptors(arrays, len(metadata.cameras)))
 
 
 def _descriptors(arrays: dict[str, np.ndarray], views: int) -> np.ndarray | None:

@@ -6,11 +6,10 @@ import itertools
 from collections.abc import Callable
 
 import numpy as np
-from scipy.ndimage import distance_transform_cdt
 
 from fieldpose.stages.geometry.cameras import Camera
 from fieldpose.stages.nerf.kernels.density import raise_to
-from fieldpose.stages.nerf.kernels.space import BLOCK
+from fieldpose.stages.nerf.kernels.types import BLOCK
 from fieldpose.stages.nerf.metadata import Space
 
 
@@ -19,6 +18,9 @@ def pack(occupied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
     A block's distance is the largest difference of an index to that of the nearest occupied block, at most 255.
     """
+    # Half a second to import, which no process needs that only reads a field.
+    from scipy.ndimage import distance_transform_cdt
+
     n = occupied.shape[0]
     m = n // BLOCK
     blocks = occupied.reshape(m, BLOCK, m, BLOCK, m, BLOCK).any(axis=(1, 3, 5))

@@ -47,3 +47,8 @@ class RefinementConfig:
     def on(self) -> bool:
         """Whether poses are refined at all."""
         return self.when != "never" and self.steps > 0
+
+    @property
+    def needs_jacobian(self) -> bool:
+        """Whether the field's own derivatives are asked for."""
+        return self.on and self.derivative == "field"

@@ -249,9 +249,9 @@ HOLDER = """
 
 
 def pools_of_this_process() -> set[str]:
-    """The files of shared memory of at least 64 MB that this process has mapped."""
+    """The files of shared memory of at least 16 MB that this process has mapped."""
     mapped = {line.split()[-1] for line in Path("/proc/self/maps").read_text().splitlines() if ".zenoh" in line}
-    return {path for path in mapped if Path(path).exists() and Path(path).stat().st_size >= 64 << 20}
+    return {path for path in mapped if Path(path).exists() and Path(path).stat().st_size >= 16 << 20}
 
 
 HUB = "import sys; from fieldpose.bus.transport import serve_hub; serve_hub(sys.argv[1])"

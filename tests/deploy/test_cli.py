@@ -84,7 +84,7 @@ def test_mistakes_are_one_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     # These change this very process.
     monkeypatch.setattr("fieldpose.deploy.commands.stage.log_to_stderr", lambda: None)
-    monkeypatch.setattr("fieldpose.deploy.commands.stage.thread_environment", lambda threads: {})
+    monkeypatch.setattr("fieldpose.deploy.commands.stage.hold_to", lambda threads: None)
     assert main(arguments) == 2
     line = only_line(capsys)
     assert line.startswith("fieldpose: ")

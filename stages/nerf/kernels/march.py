@@ -8,8 +8,8 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
-from fieldpose.stages.nerf.kernels.space import BLOCK, clip, occupied, skip, to_cube
-from fieldpose.stages.nerf.kernels.types import Domain, Rays, Samples
+from fieldpose.stages.nerf.kernels.space import clip, occupied, skip, to_cube
+from fieldpose.stages.nerf.kernels.types import BLOCK, Domain, Rays, Samples
 
 TINY, HUGE = np.float32(1e-9), np.float32(1e9)
 

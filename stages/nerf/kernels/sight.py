@@ -9,8 +9,7 @@ from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
 from fieldpose.stages.kernel_cache import cached_njit
-from fieldpose.stages.nerf.kernels.space import BLOCK
-from fieldpose.stages.nerf.kernels.types import Domain, Rays
+from fieldpose.stages.nerf.kernels.types import BLOCK, Domain, Rays
 
 NEVER = np.float32(np.inf)
 

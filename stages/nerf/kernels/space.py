@@ -8,10 +8,7 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
-from fieldpose.stages.nerf.kernels.types import Domain
-
-BLOCK = 4
-"""Cells along each side of a block."""
+from fieldpose.stages.nerf.kernels.types import BLOCK, Domain
 
 
 @njit(inline="always")

@@ -7,6 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 SH_SIZE = 16
+BLOCK = 4
+"""Cells along each side of a block of the occupancy grid."""
 
 
 class Net(NamedTuple):

@@ -59,8 +59,15 @@ def _pnp(settings: Settings, field: Path | None) -> None:
     warm_up(settings.pnp)
 
 
+def _tracking(settings: Settings, field: Path | None) -> None:
+    from fieldpose.stages.following.core import warm_up
+
+    if settings.following.when == "always":
+        warm_up()
+
+
 _IMPORTED = ("fieldpose.deploy.commands.stage", "fieldpose.stages.nerf.loading", "fieldpose.stages.pnp.core")
-_KERNELS = {"rendering": _rendering, "pnp": _pnp}
+_KERNELS = {"rendering": _rendering, "pnp": _pnp, "tracking": _tracking}
 """By the process that cannot do without."""
 
 

@@ -183,7 +183,8 @@ class FollowedPolicy(VideoPolicy):
 
     def _in_reach(self, frame: FrameInfo, followed: Followed) -> bool:
         reach = self._reach(frame.capture_ns - self._motion.newest_ns)
-        return reach.holds(self._motion.predict(frame.capture_ns), followed.cam_from_object)
+        expected = self._motion.predict(frame.capture_ns), self._motion.newest
+        return any(reach.holds(pose, followed.cam_from_object) for pose in expected)
 
     def _believe(self, frame: FrameInfo, measured: Measured) -> Belief:
         if not self._trust.tracked:

@@ -11,6 +11,8 @@ from fieldpose.stages.tracking.config import MotionConfig
 
 NS_PER_MS = 1e6
 _REMEMBERED = 16
+_LEAST_BETWEEN_NS = 5_000_000
+"""Poses nearer in time, as wrong stamps have them, tell nothing of the velocity."""
 
 
 class MotionModel:
@@ -82,6 +84,10 @@ class MotionModel:
         newest = self._times_ns[-1]
         first = bisect.bisect_left(self._times_ns, newest - int(self._config.window_ms * NS_PER_MS))
         first = min(first, len(self._times_ns) - 2)
+        while first > 0 and newest - self._times_ns[first] < _LEAST_BETWEEN_NS:
+            first -= 1
+        if newest - self._times_ns[first] < _LEAST_BETWEEN_NS:
+            return None
         return first if newest - self._times_ns[first] <= self._config.horizon_ms * NS_PER_MS else None
 
     def _damped(self, ahead_s: float) -> float:

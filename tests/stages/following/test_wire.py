@@ -131,7 +131,7 @@ def test_pixels_of_the_shrunk_image_are_told_in_the_frames(longer_side: int) -> 
     pixels = np.concatenate([corners, small.project(points)]).astype(np.float32)
     unknown = np.eye(6)
     followed = Followed(
-        np.eye(4), unknown, unknown, longer_side, pixels, np.ones(len(pixels), bool), 1.0, 0, 0.0
+        np.eye(4), unknown, unknown, longer_side, pixels, np.ones(len(pixels), bool), 1.0, 0, 0.0, 0.0, 1.0
     )  # fmt: skip
     there = in_frame(followed, LENS)
     assert there.dtype == np.float32

@@ -33,7 +33,7 @@ class FollowingConfig:
     same: Limit = Limit(2.0, 0.02)
     """a solve's pose further than this from what was followed speaks against that; x scale"""
     found_again: float = 0.6
-    """what a pose must score to be followed again once tracking was lost, without a solve"""
+    """what a pose must score to be believed where the motion does not lead there, as once tracking was lost"""
     lost_after: int = 15
     """frames in a row that could not be followed until tracking is lost"""
     weak_after: int = 90

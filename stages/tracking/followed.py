@@ -81,9 +81,8 @@ class FollowedPolicy(VideoPolicy):
         measured = self._measure(self._kept[-1], self._starts(frame, image))
         if measured is None:
             return self._not_followed(frame, Reason.NO_CONSENSUS), None
-        tracked = self._on_track(frame)
-        least = self._config.score.usable if tracked else self._follows.found_again
-        if measured.quality < least or (tracked and not self._in_reach(frame, measured.followed)):
+        near = self._on_track(frame) and self._in_reach(frame, measured.followed)
+        if measured.quality < (self._config.score.usable if near else self._follows.found_again):
             return self._not_followed(frame, Reason.IMPLAUSIBLE_POSE), measured.followed
         return self._believe(frame, measured), measured.followed
 
@@ -183,8 +182,7 @@ class FollowedPolicy(VideoPolicy):
 
     def _in_reach(self, frame: FrameInfo, followed: Followed) -> bool:
         reach = self._reach(frame.capture_ns - self._motion.newest_ns)
-        expected = self._motion.predict(frame.capture_ns), self._motion.newest
-        return any(reach.holds(pose, followed.cam_from_object) for pose in expected)
+        return reach.holds(self._motion.predict(frame.capture_ns), followed.cam_from_object)
 
     def _believe(self, frame: FrameInfo, measured: Measured) -> Belief:
         if not self._trust.tracked:

@@ -11,7 +11,7 @@ from fieldpose.stages.tracking.config import MotionConfig
 
 NS_PER_MS = 1e6
 _REMEMBERED = 16
-_LEAST_BETWEEN_NS = 5_000_000
+_LEAST_BETWEEN_NS = 1_000_000
 """Poses nearer in time, as wrong stamps have them, tell nothing of the velocity."""
 
 

@@ -63,7 +63,7 @@ class Options:
     passes: int | None = None
     """Most passes over a frame (short for --tracking.passes)."""
     depth: int | None = None
-    """Frames in flight at once (short for --tracking.depth)."""
+    """Frames solved at once, where they are not followed (short for --tracking.depth)."""
     matcher: str | None = None
     """xfeat, xfeat-lighterglue, aliked-lightglue, disk-lightglue, loftr or sift (short for --matching.matcher)."""
     refine: Literal["auto", "always", "never"] | None = None

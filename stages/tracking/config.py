@@ -59,7 +59,7 @@ class TrackingConfig:
     """Photos stand each by itself, in videos the motion carries on; auto: by the source, and video where another host
     has it."""
     depth: int = 2
-    """Frames in flight at once."""
+    """Frames solved at once; one where every frame is followed."""
     passes: int = 3
     """Most passes from one guess that may be far off: the pose found becomes the next guess."""
     retries: int = 1

@@ -20,7 +20,7 @@ class FollowingConfig:
     """points of a view that are kept for it, those with the most texture"""
     views: int = 24
     """views that are remembered"""
-    budget: float = 0.35
+    budget: float = 0.6
     """share of the time between frames that following one may take; beyond it fewer points are looked for"""
 
     solve_ms: float = 1000.0

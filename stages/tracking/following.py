@@ -19,7 +19,7 @@ from fieldpose.stages.tracking.motion import NS_PER_MS
 from fieldpose.stages.tracking.policy import Alike, FrameInfo, PoseResult
 
 _SMOOTHING = 0.2
-_EASED = 0.5
+_EASED = 0.7
 """Following does more again where it takes less than this share of what it may."""
 _LONGEST_AHEAD_MS = 500.0
 

@@ -13,6 +13,7 @@ from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.sources import is_video, knows_truth
 from fieldpose.stages.following.config import FollowingConfig
 from fieldpose.stages.nerf.backend import resolved
+from fieldpose.stages.nerf.config import Backend
 from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.refinement.config import RefinementConfig
 from fieldpose.stages.rendering.config import RenderingConfig
@@ -65,10 +66,9 @@ def resolve(settings: Settings, views: TrainingViews | None, field: Path | None 
             f"guess {settings.tracking.guess}: is made from true poses, which {settings.camera.source} does not know"
         )
     looks = _looks(settings, views, begins, notes)
-    backend = resolved(settings.backend)
-    notes["backend"] = f"{backend}{' (auto)' if settings.backend == 'auto' else ''}"
     camera = _camera(settings.camera, notes)
     follows = _follows(settings.following, sequence, begins, camera, notes)
+    backend = _backend(settings.backend, follows, notes)
     resolved_settings = replace(
         settings,
         backend=backend,
@@ -152,6 +152,16 @@ def _refinement(config: RefinementConfig, sequence: Sequence, notes: dict[str, s
     when: Literal["always", "never"] = "never" if sequence == "video" else "always"
     notes["refinement"] = f"{when} (auto: {sequence})"
     return replace(config, when=when)
+
+
+def _backend(wanted: Backend, follows: bool, notes: dict[str, str]) -> Backend:
+    backend = resolved(wanted)
+    notes["backend"] = f"{backend}{' (auto)' if wanted == 'auto' else ''}"
+    if wanted == "auto" and follows and backend == "cuda":
+        # On an H200 torch takes a second for a view of 256 pixels, its processor's kernels 18 ms.
+        notes["backend"] = "numba (auto: single views are sooner there than on the CUDA device)"
+        return "numba"
+    return backend
 
 
 def _device(device: str, backend: str) -> str:

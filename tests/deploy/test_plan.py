@@ -46,6 +46,13 @@ def test_videos_that_are_not_followed_get_views_used_again() -> None:
     assert resolve(changed(from_source("mcap:a.mcap"), forced, "test"), KNOWN).follows
 
 
+def test_a_cuda_device_is_not_used_where_single_views_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fieldpose.deploy.plan.resolved", lambda wanted: "cuda" if wanted == "auto" else wanted)
+    assert resolve(from_source("mcap:a.mcap"), KNOWN).settings.backend == "numba"
+    assert resolve(from_source("mcap:a.mcap", backend="cuda"), KNOWN).settings.backend == "cuda"
+    assert resolve(from_source("folder:a"), KNOWN).settings.backend == "cuda"
+
+
 def test_frames_that_stand_by_themselves_cannot_be_followed() -> None:
     for source, tracking in (("folder:a", {}), ("mcap:a.mcap", {"guess": "perturb:10-40deg,0.2"})):
         with pytest.raises(ConfigError, match="not frames of a video"):

@@ -21,7 +21,7 @@ from fieldpose.deploy.scene import demo_file
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 FIELD = demo_file("field.safetensors")
 MOST_LINES = 40
-FRAMES = 6
+FRAMES = 40
 
 
 def run_example(name: str, *arguments: object) -> subprocess.Popen[str]:

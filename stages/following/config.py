@@ -22,7 +22,6 @@ class FollowingConfig:
     """views that are remembered"""
     budget: float = 0.6
     """share of the time between frames that following one may take; beyond it fewer points are looked for"""
-
     solve_ms: float = 1000.0
     """a frame is solved at least this often, whatever is followed; and at once where little is found or no view has
     seen what the camera will see soon"""

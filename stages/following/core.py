@@ -69,7 +69,7 @@ class Followed:
 
 
 class Follower:
-    """Remembers views and finds their points in frames; all views have the size of the first."""
+    """Remembers views and finds their points in frames, which are to be shrunk to the views' size."""
 
     def __init__(self, config: FollowingConfig) -> None:
         self._config = config
@@ -80,12 +80,6 @@ class Follower:
 
     def __len__(self) -> int:
         return len(self._views)
-
-    @property
-    def longer_side(self) -> int:
-        """Of the views, in pixels; there must be one."""
-        view = next(iter(self._views.values()))
-        return max(view.camera.width, view.camera.height)
 
     def add(self, view_id: str, grey: Grey, depth: Depth, camera: Camera, cam_from_object: Transform) -> None:
         """Remember a view's points with the most texture; one that is known comes to mind again."""

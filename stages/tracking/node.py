@@ -11,7 +11,7 @@ import numpy as np
 
 from fieldpose.bus.logs import Throttle, stage_logger
 from fieldpose.bus.messages import CameraInfo, Failure, Frame, Message, Pose, Prior, Retrieved, View
-from fieldpose.bus.node import Output, first_header
+from fieldpose.bus.node import Output
 from fieldpose.bus.ports import Sequences
 from fieldpose.bus.topics import (
     CAMERA_INFO,
@@ -29,16 +29,10 @@ from fieldpose.bus.topics import (
 )  # fmt: skip
 from fieldpose.stages.following.core import warm_up
 from fieldpose.stages.following.wire import See
-from fieldpose.stages.geometry import Camera, is_rigid
+from fieldpose.stages.geometry import is_rigid
 from fieldpose.stages.tracking import core
 from fieldpose.stages.tracking.following import FollowedReport, FollowingTracker
 from fieldpose.stages.tracking.wire import RIGID_TOLERANCE, alike, copied, failed, frame_info, outputs_of, pose_result
-
-_ANY_FRAME = Frame(
-    header=first_header(0, 0), encoding="jpeg", camera=Camera(64, 64, 64.0, 64.0, 31.5, 31.5),
-    image=cv2.imencode(".jpg", np.zeros((64, 64), np.uint8))[1].ravel(),
-)  # fmt: skip
-"""Decoding the first image takes longer than others."""
 
 
 class TrackingNode:
@@ -65,7 +59,6 @@ class TrackingNode:
         self._tracker = self._make_tracker()
         if self._see is not None:
             warm_up()
-            self._see(_ANY_FRAME)
 
     def handle(self, topic: Topic[Any], message: Message) -> Iterable[Output]:
         return outputs_of(self._take_in(message, self.clock()))

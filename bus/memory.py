@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from fieldpose.bus.protocol import Closer, Closing, Sink, Watcher, key_matches
-from fieldpose.bus.topics import Topic
+from fieldpose.bus.protocol import Closer, Closing, Sink, Watcher
+from fieldpose.bus.topics import Topic, key_matches
 
 T = TypeVar("T")
 

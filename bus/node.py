@@ -9,7 +9,9 @@ import threading
 import time
 import traceback
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,13 +20,16 @@ import psutil
 from fieldpose.bus.joining import Joined, Joiner, kept
 from fieldpose.bus.logs import Throttle, stage_logger
 from fieldpose.bus.messages import Failure, Message, Reason, Stats
-from fieldpose.bus.ports import Inbox, InboxCounts, Outbox, first_header, reply_header
-from fieldpose.bus.protocol import SETTLE_S, Bus
+from fieldpose.bus.ports import Inbox, InboxCounts, Outbox, Received, first_header, reply_header
+from fieldpose.bus.protocol import SETTLE_S, Bus, Closing
 from fieldpose.bus.signals import Interrupted, StopSignals
 from fieldpose.bus.topics import FAILURE, FRAME, STATS, Address, Topic
 from fieldpose.errors import CodecError
 
-__all__ = ["EndOfInput", "Handler", "Joined", "JoinedHandler", "Output", "first_header", "reply_header", "run_node"]
+__all__ = [
+    "EndOfInput", "Handler", "Joined", "JoinedHandler", "Output", "first_header", "reply_header", "run_node",
+    "run_nodes",
+]  # fmt: skip
 
 Output = tuple[Topic[Any], Message]
 
@@ -71,6 +76,18 @@ class KeepsTime(Protocol):
 
     def tick_in_s(self, now_ns: int) -> float:
         """How long until `tick` is to be called, at most."""
+
+
+@runtime_checkable
+class HearsObjects(Protocol):
+    """A handler that hears several objects of its camera, and is told whose a message is."""
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Their names; none where it hears its own alone."""
+
+    def handle_of(self, object: str, topic: Topic[Any], message: Message) -> Iterable[Output]:
+        """As `handle`, of a message of one of them."""
 
 
 class JoinedHandler:
@@ -155,21 +172,78 @@ def run_node(
 
     An exception of `handler.start` is raised; one of `handle` or `tick` is counted, logged and survived.
     """
-    with StopSignals(stop) as signals:
-        _Node(handler, bus, address, signals.stop, stats_period_s).run(signals)
+    run_nodes([(handler, address)], bus, stop, stats_period_s)
+
+
+def run_nodes(
+    handlers: Sequence[tuple[Handler, Address]],
+    bus: Bus,
+    stop: threading.Event | None = None,
+    stats_period_s: float = STATS_PERIOD_S,
+) -> None:
+    """Run handlers of several pipelines as `run_node` does, in one thread, a message of each in turn.
+
+    One that is at the end of its input leaves the others.
+    """
+    arrived = threading.Condition()
+    nodes = [_Node(handler, bus, address, arrived, stats_period_s) for handler, address in handlers]
+    with StopSignals(stop) as signals, ExitStack() as closing:
+        # Settled first, for a recorder that runs already is to get this process's very first message.
+        bus.settle(SETTLE_S)
+        for node in nodes:
+            closing.callback(node.close)
+        # The last to be called back, and so the first: what is closed is not to be interrupted.
+        closing.callback(setattr, signals, "interrupting", False)
+        with suppress(Interrupted, EndOfInput):
+            signals.interrupting = True
+            for node in nodes:
+                node.start(signals.stop)
+            signals.interrupting = False
+            if not signals.stop.is_set():
+                _open(nodes, bus)
+                _serve(nodes, arrived, signals.stop)
+
+
+def _open(nodes: Sequence[_Node], bus: Bus) -> None:
+    """Listen, and once messages pass say that one is ready."""
+    for node in nodes:
+        node.listen()
+    if not bus.settle(SETTLE_S, images=any(node.sends_images for node in nodes)):
+        nodes[0].warn("someone on the bus does not answer")
+    for node in nodes:
+        node.be_ready()
+
+
+def _serve(nodes: Sequence[_Node], arrived: threading.Condition, stop: threading.Event) -> None:
+    serving = list(nodes)
+    while serving and not stop.is_set():
+        worked = False
+        for node in list(serving):
+            try:
+                worked |= node.step()
+            except EndOfInput:
+                serving.remove(node)
+                node.close()
+        if not worked and serving:
+            due = min(node.due for node in serving)
+            with arrived:
+                arrived.wait_for(lambda: any(node.has_some for node in serving), max(0.0, due - time.monotonic()))
 
 
 class _Node:
     def __init__(
-        self, handler: Handler, bus: Bus, address: Address, stop: threading.Event, stats_period_s: float
+        self, handler: Handler, bus: Bus, address: Address, arrived: threading.Condition, stats_period_s: float
     ) -> None:
         self._handler = handler
         self._bus = bus
         self._address = address
-        self._stop = stop
+        self._arrived = arrived
         self._stats_period_s = stats_period_s
+        self._objects = handler.objects if isinstance(handler, HearsObjects) else ()
         self._outbox = Outbox(bus, address, handler.name)
         self._inbox: Inbox | None = None
+        self._token: Closing | None = None
+        self._closed = False
         self._throttle = Throttle(stage_logger(handler.name))
         self._failed = 0
         self._busy_ms: deque[float] = deque(maxlen=_BUSY_WINDOW)
@@ -177,47 +251,67 @@ class _Node:
         self._process = psutil.Process()
         self._next_tick = self._next_stats = 0.0
 
-    def run(self, signals: StopSignals) -> None:
-        # Settled first, for a recorder that runs already is to get this process's very first message.
-        self._bus.settle(SETTLE_S)
-        self._send_stats(ready=False)
-        try:
-            signals.interrupting = True
-            if not self._stop.is_set():
-                self._handler.start()
-            signals.interrupting = False
-            if not self._stop.is_set():
-                self._serve()
-        except (Interrupted, EndOfInput):
-            pass
-        finally:
-            signals.interrupting = False
-            self._handler.stop()
-            self._send_stats(ready=False)
+    @property
+    def sends_images(self) -> bool:
+        return any(topic.priority == "data_low" for topic in self._handler.outputs)
 
-    def _serve(self) -> None:
+    @property
+    def due(self) -> float:
+        """When it is to be called next, by the monotonic clock."""
+        return min(self._next_tick, self._next_stats)
+
+    @property
+    def has_some(self) -> bool:
+        """Whether a message waits for it."""
+        return self._inbox is not None and self._inbox.has_some
+
+    def start(self, stop: threading.Event) -> None:
+        self._send_stats(ready=False)
+        if not stop.is_set():
+            self._handler.start()
+
+    def listen(self) -> None:
         joins = isinstance(self._handler, JoinedHandler)
         capacities = {topic: kept(topic) for topic in self._handler.inputs} if joins else None
-        self._inbox = Inbox(self._bus, self._address, self._handler.inputs, capacities, self._refused)
-        if not self._bus.settle(SETTLE_S, images=any(topic.priority == "data_low" for topic in self._handler.outputs)):
-            self._throttle.warning("someone on the bus does not answer")
-        token = self._bus.hold(self._address.live(self._handler.name))
-        try:
-            while not self._stop.is_set():
-                self._step(self._inbox)
-        finally:
-            token.close()
-            self._inbox.close()
+        heard = replace(self._address, object="*") if self._objects else self._address
+        inputs = self._handler.inputs
+        self._inbox = Inbox(self._bus, heard, inputs, capacities, self._refused, self._arrived)
 
-    def _step(self, inbox: Inbox) -> None:
-        received = inbox.get(max(0.0, min(self._next_tick, self._next_stats) - time.monotonic()))
+    def be_ready(self) -> None:
+        self._token = self._bus.hold(self._address.live(self._handler.name))
+
+    def warn(self, what: str) -> None:
+        self._throttle.warning(what)
+
+    def step(self) -> bool:
+        """Handle a message if one waits, and do what is due; returns whether one did."""
+        received = self._inbox.get(0.0) if self._inbox is not None else None
         if received is not None:
-            self._run(lambda: self._handler.handle(received.topic, received.message))
+            self._run(lambda: self._handled(received))
         if time.monotonic() >= self._next_tick:
             self._run(lambda: self._handler.tick(time.time_ns()))
             self._next_tick = time.monotonic() + self._tick_in_s()
         if time.monotonic() >= self._next_stats:
             self._send_stats(ready=True)
+        return received is not None
+
+    def close(self) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        for listening in (self._token, self._inbox):
+            if listening is not None:
+                listening.close()
+        self._handler.stop()
+        self._send_stats(ready=False)
+
+    def _handled(self, received: Received) -> Iterable[Output]:
+        if not isinstance(self._handler, HearsObjects) or not self._objects:
+            return self._handler.handle(received.topic, received.message)
+        sender = received.topic.address_of(received.key)
+        if sender is None or sender.object not in self._objects:
+            return ()
+        return self._handler.handle_of(sender.object, received.topic, received.message)
 
     def _tick_in_s(self) -> float:
         if not isinstance(self._handler, KeepsTime):

@@ -104,7 +104,7 @@ class Inbox:
     """Bounded queues of several topics, read by one thread in the order of arrival.
 
     `capacities` replaces the table's bound for some topics; `refused(topic, error)` is told of each payload that is
-    no message.
+    no message; `arrived` is notified of each that comes, for one thread that reads several inboxes.
     """
 
     def __init__(
@@ -114,12 +114,13 @@ class Inbox:
         topics: Iterable[Topic[Any]],
         capacities: Mapping[Topic[Any], int] | None = None,
         refused: Callable[[Topic[Any], CodecError], None] | None = None,
+        arrived: threading.Condition | None = None,
     ) -> None:
         self.counts = InboxCounts()
         self._sequences = Sequences()
         self._refused = refused
         self._arrival = 0
-        self._arrived = threading.Condition()
+        self._arrived = arrived or threading.Condition()
         self._queues = [_Queue(topic, (capacities or {}).get(topic, topic.capacity)) for topic in topics]
         self._newest_only = {queue.topic for queue in self._queues if queue.capacity == 1}
         self._subscriptions: list[Closing] = [
@@ -136,6 +137,11 @@ class Inbox:
             received = self._decode(*item)
             if received is not None:
                 return received
+
+    @property
+    def has_some(self) -> bool:
+        """Whether anything waits, be it a message or not."""
+        return any(queue.items for queue in self._queues)
 
     def drain(self) -> list[Received]:
         """Every message that is here now."""
@@ -160,7 +166,7 @@ class Inbox:
 
     def _take(self, timeout_s: float) -> tuple[Topic[Any], str, bytes, int] | None:
         with self._arrived:
-            if not any(queue.items for queue in self._queues) and timeout_s > 0:
+            if not self.has_some and timeout_s > 0:
                 self._arrived.wait(timeout_s)
             waiting = [queue for queue in self._queues if queue.items]
             if not waiting:

@@ -18,7 +18,8 @@ from typing import Annotated
 
 import msgspec
 
-from fieldpose.bus.protocol import SETTLE_S, Closer, Closing, Watcher, key_matches
+from fieldpose.bus.protocol import SETTLE_S, Closer, Closing, Watcher
+from fieldpose.bus.topics import key_matches
 from fieldpose.errors import TransportError
 
 _Key = Annotated[str, msgspec.Meta(max_length=512)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, Protocol
 
 from fieldpose.bus.topics import Address, Topic
@@ -67,9 +68,10 @@ class Closer:
 def wait_for(bus: Bus, address: Address, stages: Iterable[str], timeout_s: float) -> None:
     """Return once each of `stages` is ready, and what is sent from here on reaches it.
 
-    Raises TransportError that names those which are not.
+    One with an OBJECT/CAMERA/ in front is of another pipeline at the same site. Raises TransportError that names those
+    which are not.
     """
-    wanted = {address.live(stage): stage for stage in stages}
+    wanted = {_live(address, stage): stage for stage in stages}
     changed = threading.Condition()
     alive: set[str] = set()
 
@@ -78,7 +80,7 @@ def wait_for(bus: Bus, address: Address, stages: Iterable[str], timeout_s: float
             (alive.add if is_alive else alive.discard)(key)
             changed.notify()
 
-    watching = bus.watch(address.live("*"), watcher)
+    watching = bus.watch(replace(address, object="*", camera="*").live("*"), watcher)
     try:
         deadline = time.monotonic() + timeout_s
         with changed:
@@ -92,7 +94,10 @@ def wait_for(bus: Bus, address: Address, stages: Iterable[str], timeout_s: float
     raise TransportError(f"not ready on the bus after {timeout_s:g} s: {missing}; is each of them running?")
 
 
-def key_matches(pattern: str, key: str) -> bool:
-    """Whether a concrete key is one that `pattern` listens to."""
-    parts, others = pattern.split("/"), key.split("/")
-    return len(parts) == len(others) and all(a in ("*", b) for a, b in zip(parts, others, strict=True))
+def _live(address: Address, stage: str) -> str:
+    *other, name = stage.split("/")
+    if not other:
+        return address.live(name)
+    if len(other) != 2:
+        raise TransportError(f"{stage!r}: expected STAGE or OBJECT/CAMERA/STAGE")
+    return Address(address.site, *other).live(name)

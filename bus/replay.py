@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Container, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -91,6 +91,12 @@ class RecordingInfo:
     sources: list[SourceInfo] = field(default_factory=list)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, int] = field(default_factory=dict)
+
+    def of(self, address: Address) -> RecordingInfo:
+        """What of it belongs to one pipeline."""
+        topics = [topic for topic in self.topics if address.covers(topic.key)]
+        sources = [source for source in self.sources if address.covers(source.key)]
+        return replace(self, topics=topics, sources=sources, messages=sum(topic.messages for topic in topics))
 
 
 def read_recording(path: Path | str, topics: Container[Topic[Any]] | None = None) -> Iterator[Recorded]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Literal, TypeVar
 
@@ -27,15 +28,36 @@ class Address:
         for name in ("site", "object", "camera"):
             _check_part(name, getattr(self, name))
 
+    @property
+    def pair(self) -> str:
+        """OBJECT/CAMERA, its name among those of its site."""
+        return f"{self.object}/{self.camera}"
+
     def key(self, topic: Topic[Any], stage: str = "*") -> str:
         """The key of `topic` here; only the key of STATS names the stage that sends it."""
         _check_part("stage", stage)
         return topic.template.format(site=self.site, object=self.object, camera=self.camera, stage=stage)
 
+    def covers(self, key: str) -> bool:
+        """Whether a concrete key of a topic is one that this pipeline sends or receives on."""
+        return any(key_matches(self.key(topic), key) for topic in ALL)
+
     def live(self, stage: str) -> str:
         """The key of the liveliness token that `stage` holds while it is ready."""
         _check_part("stage", stage)
         return f"{self.site}/live/{self.object}/{self.camera}/{stage}"
+
+
+def shared_address(addresses: Sequence[Address]) -> Address:
+    """One that listens to all of these, which are at one site: "*" in the parts in which they differ."""
+    parts = {name: {getattr(address, name) for address in addresses} for name in ("site", "object", "camera")}
+    return Address(**{name: found.pop() if len(found) == 1 else "*" for name, found in parts.items()})
+
+
+def key_matches(pattern: str, key: str) -> bool:
+    """Whether a concrete key is one that `pattern` listens to."""
+    parts, others = pattern.split("/"), key.split("/")
+    return len(parts) == len(others) and all(a in ("*", b) for a, b in zip(parts, others, strict=True))
 
 
 def _check_part(name: str, part: str) -> None:

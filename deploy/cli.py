@@ -103,7 +103,8 @@ def _defaults(options: type[Any], arguments: list[str]) -> Any:
     from fieldpose.deploy.settings import read_settings
 
     required = [name for name, field in names.items() if _is_required(field)]
-    return options(**dict.fromkeys(required, tyro.MISSING), settings=read_settings(Path(given)))
+    settings_of = getattr(options, "settings_of", read_settings)
+    return options(**dict.fromkeys(required, tyro.MISSING), settings=settings_of(Path(given)))
 
 
 def _is_required(field: dataclasses.Field[Any]) -> bool:

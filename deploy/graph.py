@@ -14,7 +14,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from fieldpose.bus.node import Handler
 from fieldpose.bus.protocol import Bus
@@ -37,6 +37,7 @@ from fieldpose.bus.topics import (
     TRUTH,
     VIEW,
     Topic,
+    shared_address,
 )  # fmt: skip
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan
@@ -56,10 +57,14 @@ Topics = tuple[Topic[Any], ...]
 
 @dataclass(frozen=True)
 class Launch:
-    """What only a process has: its bus, what it records into, and `wait_until_ready`, which returns once all are."""
+    """What only a process has.
+
+    bus; record: what it records into; plans: of all pipelines that it serves; wait_until_ready: returns once all are.
+    """
 
     bus: Bus | None = None
     record: Path | None = None
+    plans: tuple[Plan, ...] = ()
     wait_until_ready: Callable[[], None] = lambda: None
 
 
@@ -68,9 +73,9 @@ class Process:
     """A row of the graph.
 
     reads: all that its handler may join or listen to; one with less to do reads less. needs_field: it cannot start
-    without. renders: it runs the field's kernels. parallel: its work can use several threads. solves: where every frame
-    is followed, its work is beside that and gives way to it. stop_s: how long it may take to end. wanted: whether a
-    plan has work for it.
+    without. serves: one pipeline, all of a camera, or all of a run, in turn. renders: it runs the field's kernels.
+    parallel: its work can use several threads. solves: where every frame is followed, its work is beside that and gives
+    way to it. stop_s: how long it may take to end. wanted: whether a plan has work for it.
     """
 
     name: str
@@ -78,6 +83,7 @@ class Process:
     reads: Topics = ()
     writes: Topics = ()
     needs_field: bool = False
+    serves: Literal["pipeline", "camera", "run"] = "run"
     renders: bool = False
     parallel: bool = False
     solves: bool = False
@@ -91,12 +97,13 @@ def _recorder(parts: Parts, launch: Launch) -> Handler:
 
     if launch.record is None or launch.bus is None:
         raise UsageError("the recorder needs --record FILE.mcap")
+    plans = launch.plans or (parts.plan,)
     return RecorderHandler(
         launch.bus,
-        parts.settings.address,
+        shared_address([plan.settings.address for plan in plans]),
         launch.record,
-        metadata=metadata(parts.plan),
-        attachments=attachments(parts.plan),
+        metadata=metadata(plans),
+        attachments=attachments(plans),
         resume=True,
         from_start=True,
     )
@@ -163,16 +170,16 @@ GRAPH: tuple[Process, ...] = (
     Process(HUB, None, stop_s=1.0),
     Process(RECORDER, _recorder, reads=tuple(topic for topic in ALL if topic.recorded), stop_s=60.0),
     Process(
-        CAMERA, _camera, reads=(STATE, POSE, FAILURE), writes=(TRUTH, FRAME, CAMERA_INFO),
+        CAMERA, _camera, reads=(STATE, POSE, FAILURE), writes=(TRUTH, FRAME, CAMERA_INFO), serves="camera",
         wanted=lambda plan: plan.settings.camera.source != EXTERNAL,
     ),
     Process(
-        "perturbation", _perturbation, reads=(TRUTH,), writes=(PRIOR,),
+        "perturbation", _perturbation, reads=(TRUTH,), writes=(PRIOR,), serves="pipeline",
         wanted=lambda plan: plan.begins.disturbance is not None,
     ),
     Process(
         "tracking", _tracking, reads=(FRAME, CAMERA_INFO, PRIOR, VIEW, RETRIEVED, POSE, FAILURE),
-        writes=(SEARCH, GUESS, FOLLOWED, STATE), needs_field=True,
+        writes=(SEARCH, GUESS, FOLLOWED, STATE), needs_field=True, serves="pipeline",
     ),
     Process(
         "retrieval", _retrieval, reads=(SEARCH, FRAME), writes=(RETRIEVED, FAILURE), needs_field=True, solves=True,

@@ -17,7 +17,7 @@ from fieldpose.deploy.graph import BY_NAME, threads_of
 from fieldpose.deploy.local import LocalPipeline
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan
-from fieldpose.deploy.processes.pipeline import Run, run_pipeline
+from fieldpose.deploy.processes.pipeline import run_pipeline
 from fieldpose.deploy.reporting.timeline import plot_timeline
 from fieldpose.deploy.settings import Settings, changed
 from fieldpose.errors import UsageError
@@ -150,7 +150,7 @@ def follow(case: Case, out: Path, report: Report) -> dict[str, Any]:
     plan = case.plan
     with held_to(case.cores):
         watcher = Watcher(lambda phase: report(f"{case.title}: {phase}"))
-        run = run_pipeline(Run(plan), watcher)
+        run = run_pipeline(plan, watcher)
     if run.interrupted:
         raise KeyboardInterrupt
     plot_timeline(run.frames, out / case.file_name, case.title)

@@ -12,11 +12,11 @@ from typing import Annotated
 import tyro
 from rich.progress import Progress
 
-from fieldpose.deploy.commands.run import INTERRUPTED, draw, give_out, planned
-from fieldpose.deploy.processes.pipeline import Run, run_pipeline
+from fieldpose.deploy.commands.run import INTERRUPTED, draw, planned
+from fieldpose.deploy.processes.pipeline import Run, run_pipelines
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_bytes, write_json
-from fieldpose.deploy.reporting.report import live_line
-from fieldpose.deploy.reporting.results import RunResult
+from fieldpose.deploy.reporting.report import live_line, print_summary
+from fieldpose.deploy.reporting.results import RunResult, summarise
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import Settings
 
@@ -53,9 +53,11 @@ class Options:
         camera = replace(self.settings.camera, source=f"mcap:{sequence}")
         plan = planned(replace(self.settings, camera=camera), field)
         with live_line("demo") as report:
-            outcome = run_pipeline(Run(plan, recording, logs=self.logs), report)
+            (outcome,) = run_pipelines(Run((plan,), recording, logs=self.logs), report)
         written = [recording, self.out / "summary.json"]
-        summary = give_out(outcome, "demo", written[-1])
+        summary = summarise(outcome)
+        print_summary(summary, "demo")
+        write_json(written[-1], summary)
         write_json(self.json, summary)
         if outcome.interrupted:
             return INTERRUPTED

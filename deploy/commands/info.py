@@ -58,12 +58,19 @@ def _description(recording: RecordingInfo, cameras: Mapping[str, int]) -> Iterat
     size = f"{recording.size_bytes / 1e6:.1f} MB"
     yield f"{recording.path}: {recording.messages} messages in {seconds:.1f} s from {began}, {size}"
     yield "no message lost" if recording.lossless else f"NOT LOSSLESS{_why(recording)}"
-    run = recording.metadata.get(RUN_RECORD, {})
-    yield from (f"  {name}: {value}" for name, value in run.items())
+    yield from _noted(recording, RUN_RECORD, "")
     yield from (f"  camera {CAMERA_ORIGINS[origin]}: {count} frames" for origin, count in cameras.items())
-    yield from (f"  planned: {name}: {value}" for name, value in recording.metadata.get(PLAN_RECORD, {}).items())
-    yield from (f"  edited: {name}: {value}" for name, value in recording.metadata.get(EDIT_RECORD, {}).items())
+    yield from _noted(recording, PLAN_RECORD, "planned: ")
+    yield from _noted(recording, EDIT_RECORD, "edited: ")
     yield from (f"  attached: {name} ({count} bytes)" for name, count in recording.attachments.items())
+
+
+def _noted(recording: RecordingInfo, record: str, what: str) -> Iterator[str]:
+    """What stands in the records of a name, those of each of several pipelines after it."""
+    for name, values in recording.metadata.items():
+        if name == record or name.startswith(f"{record} "):
+            whose = name.removeprefix(record).strip()
+            yield from (f"  {whose}{': ' if whose else ''}{what}{key}: {value}" for key, value in values.items())
 
 
 def _why(recording: RecordingInfo) -> str:

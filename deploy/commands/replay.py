@@ -15,12 +15,13 @@ from fieldpose.bus.messages import State
 from fieldpose.bus.replay import RecordingInfo, info, read_recording
 from fieldpose.bus.topics import STATE
 from fieldpose.deploy.commands.run import INTERRUPTED, planned
-from fieldpose.deploy.processes.pipeline import Run, run_pipeline
+from fieldpose.deploy.processes.pipeline import run_pipeline
 from fieldpose.deploy.reporting.output import check_writable, result_console, write_json
-from fieldpose.deploy.reporting.provenance import recorded_field, recorded_settings
+from fieldpose.deploy.reporting.provenance import pipelines_in, recorded_field, recorded_settings
 from fieldpose.deploy.reporting.report import live_line, print_summary
 from fieldpose.deploy.reporting.results import FrameResult, spread, summarise
 from fieldpose.deploy.settings import Settings, changed, read_file
+from fieldpose.errors import UsageError
 from fieldpose.stages.camera.config import Pace
 from fieldpose.stages.geometry import rotation_error_deg, translation_error
 
@@ -38,6 +39,8 @@ class Options:
 
     recording: tyro.conf.Positional[Path]
     """The recording (.mcap)."""
+    pipeline: str | None = None
+    """OBJECT/CAMERA: which of its pipelines, where it holds several."""
     field: Path | None = None
     """Another field than the recording's."""
     config: Path | None = None
@@ -53,33 +56,48 @@ class Options:
         """Run, compare, print."""
         check_writable(self.record, self.json)
         recorded = info(self.recording)
+        _check_pipeline(self.recording, self.pipeline, pipelines_in(recorded))
         with tempfile.TemporaryDirectory(prefix="fieldpose-") as folder, live_line("replay") as report:
-            field = self.field or recorded_field(self.recording, recorded, Path(folder))
-            outcome = run_pipeline(Run(planned(self._settings(), field), self.record), report)
+            field = self.field or recorded_field(self.recording, recorded, Path(folder), self.pipeline)
+            outcome = run_pipeline(planned(self._settings(), field), report, self.record)
         summary = summarise(outcome)
-        comparison = compare(recorded_poses(self.recording), outcome.frames)
+        comparison = compare(recorded_poses(self.recording, self.pipeline), outcome.frames)
         print_summary(summary, f"replay of {self.recording}")
         _print(comparison, recorded)
         write_json(self.json, {**comparison, "replay": summary})
         return INTERRUPTED if outcome.interrupted else 0
 
     def _settings(self) -> Settings:
-        settings = recorded_settings(self.recording)
+        settings = recorded_settings(self.recording, self.pipeline)
         if self.config is not None:
             settings = changed(settings, read_file(self.config), str(self.config))
         # The frames are recorded as they were sent: shrunk, and with their camera.
         camera = replace(settings.camera, source=f"mcap:{self.recording}", size=None, camera_file=None, pace=self.pace)
+        camera = replace(camera, recorded=self.pipeline, objects=())
         return replace(settings, camera=camera)
 
 
-def recorded_poses(path: Path) -> dict[int, np.ndarray]:
+def _check_pipeline(path: Path, wanted: str | None, held: Sequence[str]) -> None:
+    if held and wanted not in held:
+        raise UsageError(f"{path}: holds the pipelines {', '.join(held)}; choose one with --pipeline")
+    if wanted is not None and not held:
+        raise UsageError(f"{path}: holds one pipeline, which needs no --pipeline")
+
+
+def recorded_poses(path: Path, pipeline: str | None = None) -> dict[int, np.ndarray]:
     """The measured pose of each frame of a recording, as its tracking reported them. Raises RecordingError."""
-    states = (cast(State, recorded.message) for recorded in read_recording(path, (STATE,)))
+    everything = read_recording(path, (STATE,))
+    states = (cast(State, one.message) for one in everything if pipeline is None or _is_of(one.key, pipeline))
     return {
         state.header.frame_id: np.array(state.cam_from_object)
         for state in states
         if state.cam_from_object is not None and state.score > 0
     }
+
+
+def _is_of(key: str, pipeline: str) -> bool:
+    sender = STATE.address_of(key)
+    return sender is not None and sender.pair == pipeline
 
 
 def compare(recorded: Mapping[int, np.ndarray], results: Sequence[FrameResult]) -> dict[str, Any]:

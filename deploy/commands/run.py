@@ -10,12 +10,12 @@ from typing import Annotated, Literal
 import tyro
 
 from fieldpose.deploy.plan import Plan, resolve
-from fieldpose.deploy.processes.pipeline import Run, run_pipeline
+from fieldpose.deploy.processes.pipeline import Run, run_pipelines
 from fieldpose.deploy.reporting.output import check_picture, check_writable, write_bytes, write_json
 from fieldpose.deploy.reporting.report import live_line, print_plan, print_summary
 from fieldpose.deploy.reporting.results import RunResult, summarise, to_csv
+from fieldpose.deploy.rig import planned_rig, read_rig
 from fieldpose.deploy.settings import Settings, overridden
-from fieldpose.errors import UsageError
 from fieldpose.stages.camera.config import Pace
 from fieldpose.stages.nerf.field import load_field
 from fieldpose.stages.nerf.training_views import training_views
@@ -30,15 +30,20 @@ class Options:
     Example: fieldpose run out/lego.safetensors --source dataset:../shared/data/lego:test
     --guess perturb:10-40deg,0.2 --record out/lego.mcap --json out/lego.json
 
+    Several fields and several sources make several pipelines on one bus: every object is looked for in every camera's
+    frames, and the JSON file has the figures of each under pipelines -> OBJECT/CAMERA. A configuration file may have a
+    table [objects.NAME] with field = FILE for each object, and [cameras.NAME] with source = SOURCE for each camera,
+    and in it what differs from the others.
+
     Ctrl-C ends the run and leaves a finished recording. What the keys of the JSON file mean stands in
     deploy/reporting/results.py.
     """
 
-    field: tyro.conf.Positional[Path]
-    """The field (.safetensors) of the object or scene."""
-    source: str | None = None
+    field: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="FIELD ...")] = ()
+    """The field (.safetensors) of the object or scene; of several objects FILE or NAME=FILE each."""
+    source: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """folder:DIR, dataset:DIR:test, video:FILE, camera:0 or mcap:FILE; bus: other programs send the frames, see
-    examples/ (short for --camera.source)."""
+    examples/; once for each of several cameras, as SOURCE or NAME=SOURCE (of one short for --camera.source)."""
     record: Path | None = None
     """Record every message into this file (.mcap)."""
     json: Path | None = None
@@ -76,31 +81,42 @@ class Options:
     """TOML or JSON file of settings; flags win over it."""
     settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
 
+    @staticmethod
+    def settings_of(config: Path) -> Settings:
+        """The settings of a configuration file that may tell of several objects and cameras."""
+        return read_rig(config)[0]
+
     def run(self) -> int:
         """Run, print the figures, write what was asked for."""
-        plan = planned(self.with_shortcuts(), self.field)
-        source = plan.settings.camera.source
+        plans = planned_rig(self.with_shortcuts(), read_rig(self.config)[1], self.field, self.source)
+        titles = [_title(plan, len(plans) > 1) for plan in plans]
         if self.dry_run:
-            print_plan(plan)
+            for plan, title in zip(plans, titles, strict=True):
+                print_plan(plan, title)
             return 0
         check_writable(self.record, self.json, self.csv)
         check_picture(self.plot)
-        with live_line(source) as report:
-            outcome = run_pipeline(Run(plan, self.record, self.listen, self.logs), report)
-        give_out(outcome, source, self.json, self.csv)
-        if self.plot is not None:
-            draw(outcome, plan, self.plot, source)
-        return INTERRUPTED if outcome.interrupted else 0
+        with live_line(titles[0] if len(plans) == 1 else f"{len(plans)} pipelines") as report:
+            outcomes = run_pipelines(Run(plans, self.record, self.listen, self.logs), report)
+        figures = {}
+        for plan, title, outcome in zip(plans, titles, outcomes, strict=True):
+            pair = plan.settings.address.pair
+            figures[pair] = summarise(outcome)
+            print_summary(figures[pair], title)
+            if self.plot is not None:
+                draw(outcome, plan, _of_pipeline(self.plot, pair, len(plans) > 1), title)
+        write_json(self.json, {"pipelines": figures} if len(plans) > 1 else next(iter(figures.values())))
+        if self.csv is not None:
+            rows = zip((plan.settings.address for plan in plans), (outcome.frames for outcome in outcomes), strict=True)
+            write_bytes(self.csv, to_csv(rows))
+        return INTERRUPTED if any(outcome.interrupted for outcome in outcomes) else 0
 
     def with_shortcuts(self) -> Settings:
-        """The settings with the short flags applied. Raises UsageError, and ConfigError for bad values."""
+        """The settings with the short flags applied. Raises ConfigError for bad values."""
         s = self.settings
-        camera = overridden(s.camera, source=self.source, size=self.size, pace=self.pace)
-        if not camera.source:
-            raise UsageError("no source of images; give --source, for instance --source folder:DIR")
         return overridden(
             s,
-            camera=camera,
+            camera=overridden(s.camera, size=self.size, pace=self.pace),
             tracking=overridden(
                 s.tracking, guess=self.guess, passes=self.passes, depth=self.depth, sequence=self.sequence
             ),
@@ -109,19 +125,18 @@ class Options:
         )
 
 
+def _title(plan: Plan, several: bool) -> str:
+    source, address = plan.settings.camera.source, plan.settings.address
+    return f"{address.object} in {address.camera} ({source})" if several else source
+
+
+def _of_pipeline(path: Path, pair: str, several: bool) -> Path:
+    return path.with_stem(f"{path.stem}-{pair.replace('/', '-')}") if several else path
+
+
 def planned(settings: Settings, field: Path) -> Plan:
     """The plan of a run with a field's file. Raises FieldFileError, ConfigError, SourceError and DatasetError."""
     return resolve(settings, training_views(load_field(field)), field)
-
-
-def give_out(outcome: RunResult, title: str, json: Path | None, csv: Path | None = None) -> dict[str, object]:
-    """Print and write the figures of a run; returns them."""
-    summary = summarise(outcome)
-    print_summary(summary, title)
-    write_json(json, summary)
-    if csv is not None:
-        write_bytes(csv, to_csv(outcome.frames))
-    return summary
 
 
 def draw(outcome: RunResult, plan: Plan, path: Path, title: str) -> None:

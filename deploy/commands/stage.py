@@ -6,14 +6,14 @@ import dataclasses
 import os
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from fieldpose.bus.logs import stage_logger
-from fieldpose.bus.node import Handler, run_node
+from fieldpose.bus.node import Handler, run_nodes
 from fieldpose.bus.transport import LOCAL_HUB, ZenohBus, log_to_stderr, serve_hub, wait_for
 from fieldpose.deploy.graph import (
     AT_WORK,
@@ -31,7 +31,7 @@ from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan, resolve
 from fieldpose.deploy.processes.endpoints import peer_address
 from fieldpose.deploy.processes.lifeline import die_with_parent
-from fieldpose.deploy.processes.preload import field_of
+from fieldpose.deploy.processes.preload import field_of, pipelines_of
 from fieldpose.deploy.processes.threads import hold_to
 from fieldpose.deploy.processes.warmup import compile_kernels
 from fieldpose.deploy.settings import Settings
@@ -70,11 +70,13 @@ class Options:
     field: Annotated[Path | None, tyro.conf.arg(help=_FIELD)] = None
     record: Path | None = None
     """The recorder's file (.mcap)."""
+    pipelines: Path | None = None
+    """A file that lists several pipelines, their settings and fields; this process serves them in turn."""
     threads: int | None = None
     """Threads that it may use (default: by the graph)."""
     wait_for: tuple[str, ...] | None = None
-    """Processes that must be ready before this one begins (default: none, and for the camera, which sends nothing
-    before they are, all that its frames pass)."""
+    """Processes that must be ready before this one begins, those of other pipelines as OBJECT/CAMERA/PROCESS (default:
+    none, and for the camera, which sends nothing before they are, all that its frames pass)."""
     config: Path | None = None
     """TOML or JSON file of settings."""
     settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
@@ -98,36 +100,60 @@ class Options:
 
 
 def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handler]) -> None:
-    plan, field = planned(options, row)
-    threads = options.threads or threads_of(row, plan.in_flight)
+    served = _served(options, row)
+    plans = tuple(plan for plan, _ in served)
+    threads = options.threads or threads_of(row, max(plan.in_flight for plan in plans))
     hold_to(threads)
-    parts = Parts(plan, threads)
-    if field is not None:
-        parts.field = field
-    if options.field is not None and row.renders and plan.settings.backend == "numba":
-        compile_kernels(options.field, plan.settings.refinement.needs_jacobian)
-    address = options.settings.address
+    each = [_parts(plan, field, threads, row) for plan, field in served]
+    address = plans[0].settings.address
     # In whatever order they are started, the first frame finds all that work on it.
-    passed = tuple(other.name for other in rows_of(plan, recorded=False) if other.name in AT_WORK)
-    awaited = options.wait_for if options.wait_for is not None else passed if row.name == CAMERA else ()
-    if plan.follows and row.solves:
+    awaited = options.wait_for if options.wait_for is not None else _passed(plans[0]) if row.name == CAMERA else ()
+    if row.solves and any(plan.follows for plan in plans):
         os.nice(_GIVES_WAY)
     bus = ZenohBus(options.connect, options.listen or peer_address(options.connect))
-    _tell(plan, row)
+    for plan in plans:
+        _tell(plan, row)
 
     def wait_until_ready() -> None:
         wait_for(bus, address, awaited, _START_S)
 
     # The camera waits for the stages once it is at work; those that listen are to get its very first message.
-    first = awaited if row.name != CAMERA else tuple(name for name in awaited if name not in STAGES)
+    first = awaited if row.name != CAMERA else tuple(name for name in awaited if name.rpartition("/")[2] not in STAGES)
 
     try:
-        handler = make(parts, Launch(bus, options.record, wait_until_ready))
+        launch = Launch(bus, options.record, plans, wait_until_ready)
+        # A recorder is one for all.
+        those = each[:1] if row.name == RECORDER else each
+        handlers = [(make(parts, launch), parts.settings.address) for parts in those]
         bus.wait_for_hub(_START_S)
         wait_for(bus, address, first, _START_S)
-        run_node(handler, bus, address)
+        run_nodes(handlers, bus)
     finally:
         bus.close()
+
+
+def _served(options: Options, row: Process) -> list[tuple[Plan, Field | None]]:
+    """The plans that the process serves, each with its field if it needs that."""
+    if options.pipelines is None:
+        return [planned(options, row)]
+    those = [one for one in pipelines_of(options.pipelines) if row.name in one.processes]
+    return [planned(replace(options, settings=one.settings, field=one.field), row) for one in those]
+
+
+def _parts(plan: Plan, field: Field | None, threads: int, row: Process) -> Parts:
+    parts = Parts(plan, threads)
+    if field is not None:
+        parts.field = field
+    if plan.field is not None and row.renders and plan.settings.backend == "numba":
+        compile_kernels(plan.field, plan.settings.refinement.needs_jacobian)
+    return parts
+
+
+def _passed(plan: Plan) -> tuple[str, ...]:
+    """What a camera's frames pass, of every object that it serves."""
+    names = [row.name for row in rows_of(plan, recorded=False) if row.name in AT_WORK]
+    here, objects = plan.settings.address, plan.settings.camera.objects
+    return tuple(f"{object}/{here.camera}/{name}" for object in objects or (here.object,) for name in names)
 
 
 def _plans_by_field(options: Options, row: Process) -> bool:

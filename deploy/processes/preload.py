@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import json
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,22 +21,47 @@ if TYPE_CHECKING:
     from fieldpose.stages.nerf.field import Field
 
 
-def preload(config: str, field: str, *names: str) -> None:
-    """Load what the processes of these names need, with the settings in a file and a field; no thread is started.
+@dataclass(frozen=True)
+class Pipeline:
+    """What the processes of a pipeline are started with."""
+
+    settings: Settings
+    field: Path | None
+    processes: tuple[str, ...]
+
+
+def pipelines_of(file: str | Path) -> list[Pipeline]:
+    """The pipelines of a run, as `programs` has listed them. Raises ConfigError."""
+    listed = json.loads(Path(file).read_text(encoding="utf-8"))
+    return [
+        Pipeline(read_settings(one["settings"]), one["field"] and Path(one["field"]), tuple(one["processes"]))
+        for one in listed
+    ]
+
+
+def preload(file: str) -> None:
+    """Load what the processes of a run need, whose pipelines a file lists; no thread is started.
 
     What goes wrong is left to the process that needs it, which tells.
     """
     hold_to(1)
-    settings, path = read_settings(config), Path(field) if field else None
-    kernels = [partial(work, settings, path) for name, work in _KERNELS.items() if name in names]
+    pipelines = pipelines_of(file)
+    kernels = [partial(_of_each, work, name, pipelines) for name, work in _KERNELS.items()]
     for module in _IMPORTED:
         importlib.import_module(module)
     # Compiled by others the first time, which takes half a minute and memory that would stay; then only read.
     with beside(*kernels):
-        _networks(settings, names)
+        for pipeline in pipelines:
+            _networks(pipeline.settings, pipeline.processes)
     for work in kernels:
         work()
     hold_to(1)
+
+
+def _of_each(work: Callable[[Settings, Path | None], None], name: str, pipelines: Sequence[Pipeline]) -> None:
+    for pipeline in pipelines:
+        if name in pipeline.processes:
+            work(pipeline.settings, pipeline.field)
 
 
 @cache

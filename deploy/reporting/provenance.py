@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import platform
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import metadata as packages
 from pathlib import Path
@@ -22,8 +23,64 @@ FIELD_ATTACHMENT = "field.safetensors"
 _PACKAGES = ("fieldpose", "numpy", "torch", "kornia", "numba", "opencv-python-headless", "eclipse-zenoh")
 
 
-def metadata(plan: Plan) -> Metadata:
-    """Names, seeds and versions, as text, and what was decided for the run."""
+def metadata(plans: Sequence[Plan]) -> Metadata:
+    """Names, seeds and versions, as text, and what was decided for the run; of each of several pipelines its own."""
+    records: dict[str, Mapping[str, str]] = {}
+    for plan in plans:
+        records |= {_record(RUN_RECORD, plan, plans): _made_with(plan), _record(PLAN_RECORD, plan, plans): plan.notes}
+    return records
+
+
+def attachments(plans: Sequence[Plan]) -> list[Attachment]:
+    """The settings with which a run can be repeated, nothing in them left open, and the fields themselves."""
+    items: dict[str, Attachment] = {}
+    for plan in plans:
+        whose, object = _folder(plan, plans), f"{plan.settings.address.object}/" if len(plans) > 1 else ""
+        made = [Attachment(whose + SETTINGS_ATTACHMENT, "application/json", to_json(plan.settings))]
+        if plan.field is not None:
+            made.append(Attachment(object + FIELD_ATTACHMENT, "application/octet-stream", plan.field.read_bytes()))
+        items |= {attachment.name: attachment for attachment in made}
+    return list(items.values())
+
+
+def pipelines_in(recording: RecordingInfo) -> list[str]:
+    """OBJECT/CAMERA of each pipeline of a recording that holds several; nothing where it holds one."""
+    ending = f"/{SETTINGS_ATTACHMENT}"
+    return sorted(name.removesuffix(ending) for name in recording.attachments if name.endswith(ending))
+
+
+def recorded_settings(path: Path, pipeline: str | None = None) -> Settings:
+    """The settings of a recorded run, without those that this version no longer has, which is said in its log.
+
+    pipeline: OBJECT/CAMERA, where the recording holds several. Raises RecordingError where it has none.
+    """
+    name = SETTINGS_ATTACHMENT if pipeline is None else f"{pipeline}/{SETTINGS_ATTACHMENT}"
+    content = json.loads(read_attachment(path, name))
+    gone = without_unknown(Settings(), content)
+    if gone:
+        stage_logger("replay").warning("settings of another version are left out", names=", ".join(gone))
+    return changed(Settings(), content, f"{path}: {name}")
+
+
+def recorded_field(path: Path, recording: RecordingInfo, folder: Path, pipeline: str | None = None) -> Path:
+    """The field of a recorded run: its own file where that is still the same, else a copy put into `folder`.
+
+    pipeline: OBJECT/CAMERA, where the recording holds several. Raises RecordingError where it has none.
+    """
+    record = RUN_RECORD if pipeline is None else f"{RUN_RECORD} {pipeline}"
+    name = FIELD_ATTACHMENT if pipeline is None else f"{pipeline.partition('/')[0]}/{FIELD_ATTACHMENT}"
+    noted = recording.metadata.get(record, {})
+    original = Path(noted["field"]) if "field" in noted else None
+    if original is not None and original.is_file() and sha256_of(original) == noted.get("field_sha256"):
+        return original
+    if name not in recording.attachments:
+        raise RecordingError(f"{path}: holds no field, and {original or 'none'} is not there; give --field FIELD")
+    copy = folder / FIELD_ATTACHMENT
+    copy.write_bytes(read_attachment(path, name))
+    return copy
+
+
+def _made_with(plan: Plan) -> dict[str, str]:
     settings, field = plan.settings, plan.field
     values = {
         "source": settings.camera.source,
@@ -34,43 +91,15 @@ def metadata(plan: Plan) -> Metadata:
     }
     if field is not None:
         values |= {"field": str(field), "field_sha256": sha256_of(field)}
-    return {RUN_RECORD: values | {f"version {name}": _version(name) for name in _PACKAGES}, PLAN_RECORD: plan.notes}
+    return values | {f"version {name}": _version(name) for name in _PACKAGES}
 
 
-def attachments(plan: Plan) -> list[Attachment]:
-    """The settings with which a run can be repeated, nothing in them left open, and the field itself."""
-    items = [Attachment(SETTINGS_ATTACHMENT, "application/json", to_json(plan.settings))]
-    if plan.field is not None:
-        items.append(Attachment(FIELD_ATTACHMENT, "application/octet-stream", plan.field.read_bytes()))
-    return items
+def _folder(plan: Plan, plans: Sequence[Plan]) -> str:
+    return f"{plan.settings.address.pair}/" if len(plans) > 1 else ""
 
 
-def recorded_settings(path: Path) -> Settings:
-    """The settings of a recorded run, without those that this version no longer has, which is said in its log.
-
-    Raises RecordingError where the recording has none.
-    """
-    content = json.loads(read_attachment(path, SETTINGS_ATTACHMENT))
-    gone = without_unknown(Settings(), content)
-    if gone:
-        stage_logger("replay").warning("settings of another version are left out", names=", ".join(gone))
-    return changed(Settings(), content, f"{path}: {SETTINGS_ATTACHMENT}")
-
-
-def recorded_field(path: Path, recording: RecordingInfo, folder: Path) -> Path:
-    """The field of a recorded run: its own file where that is still the same, else a copy put into `folder`.
-
-    Raises RecordingError where the recording has none.
-    """
-    noted = recording.metadata.get(RUN_RECORD, {})
-    original = Path(noted["field"]) if "field" in noted else None
-    if original is not None and original.is_file() and sha256_of(original) == noted.get("field_sha256"):
-        return original
-    if FIELD_ATTACHMENT not in recording.attachments:
-        raise RecordingError(f"{path}: holds no field, and {original or 'none'} is not there; give --field FIELD")
-    copy = folder / FIELD_ATTACHMENT
-    copy.write_bytes(read_attachment(path, FIELD_ATTACHMENT))
-    return copy
+def _record(name: str, plan: Plan, plans: Sequence[Plan]) -> str:
+    return f"{name} {plan.settings.address.pair}" if len(plans) > 1 else name
 
 
 @cache

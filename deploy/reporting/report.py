@@ -9,7 +9,7 @@ from typing import Any
 from rich.table import Table
 
 from fieldpose.deploy.plan import Plan
-from fieldpose.deploy.processes.pipeline import Progress
+from fieldpose.deploy.processes.pipeline import Progress, Standing
 from fieldpose.deploy.reporting.output import progress_console, result_console
 
 _MISSING = "-"
@@ -42,22 +42,25 @@ def _in_words(progress: Progress) -> str:
         return f"starting, waiting for {', '.join(progress.waiting_for) or 'the camera'}"
     if progress.phase == "finishing":
         return "finishing"
-    words = [f"{progress.sent} frames sent", f"{progress.rate_hz:.1f} poses/s"]
-    if progress.state is not None:
-        state = progress.state
-        words += [
-            str(state.state),
-            f"{state.in_flight} in flight",
-            f"{state.dropped_at_the_door} dropped at the door",
-        ]
+    words = [_standing(standing, named=len(progress.standings) > 1) for standing in progress.standings]
     if progress.restarts:
         words.append(f"{progress.restarts} restarts")
-    return ", ".join(words)
+    return (" | " if len(progress.standings) > 1 else ", ").join(words)
 
 
-def print_plan(plan: Plan) -> None:
+def _standing(standing: Standing, named: bool) -> str:
+    words = [f"{standing.sent} frames sent", f"{standing.rate_hz:.1f} poses/s"]
+    state = standing.state
+    if state is not None:
+        words.append(str(state.state))
+        if not named:
+            words += [f"{state.in_flight} in flight", f"{state.dropped_at_the_door} dropped at the door"]
+    return f"{standing.address.pair}: {', '.join(words)}" if named else ", ".join(words)
+
+
+def print_plan(plan: Plan, title: str) -> None:
     """Print what was decided for a run, on stdout."""
-    table = Table(title=f"plan for {plan.settings.camera.source}", show_header=False, title_justify="left")
+    table = Table(title=f"plan for {title}", show_header=False, title_justify="left")
     for name, decision in plan.notes.items():
         table.add_row(name, decision)
     result_console().print(table)

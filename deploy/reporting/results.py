@@ -39,6 +39,7 @@ import numpy as np
 
 from fieldpose.bus.messages import Stats
 from fieldpose.bus.replay import RecordingInfo
+from fieldpose.bus.topics import Address
 from fieldpose.deploy.graph import AT_WORK
 from fieldpose.stages.geometry import rotation_error_deg, translation_error
 from fieldpose.stages.tracking.scoring import deviations
@@ -185,7 +186,7 @@ def rate_hz(results: Sequence[FrameResult]) -> float:
     return len(known) / seconds if seconds > 0 else 0.0
 
 
-def to_csv(results: Iterable[FrameResult]) -> bytes:
+def to_csv(pipelines: Iterable[tuple[Address, Sequence[FrameResult]]]) -> bytes:
     """A row for each frame; sigma_ are standard deviations of its pose, in field units and degrees."""
     text = io.StringIO()
     writer = csv.writer(text)
@@ -193,14 +194,15 @@ def to_csv(results: Iterable[FrameResult]) -> bytes:
         ["frame_id", "capture_ns", "outcome", "state", "score", "reason", "camera", "passes", "latency_ms"]
         + ["rotation_error_deg", "translation_error", "sigma_translation", "sigma_rotation_deg"]
         + [f"cam_from_object_{row}{column}" for row in range(3) for column in range(4)]
+        + ["object", "camera_name"]
     )
-    for result in results:
+    for address, result in ((address, result) for address, results in pipelines for result in results):
         turn, shift = result.errors or ("", "")
         sigmas = ("", "") if result.covariance is None else deviations(result.covariance)
         pose = [""] * 12 if result.cam_from_object is None else result.cam_from_object[:3].ravel().tolist()
         columns = [result.frame_id, result.capture_ns, result.outcome, result.state, result.score, result.reason]
         columns += [result.camera_origin, result.passes]
-        writer.writerow([*columns, result.latency_ms, turn, shift, *sigmas, *pose])
+        writer.writerow([*columns, result.latency_ms, turn, shift, *sigmas, *pose, address.object, address.camera])
     return text.getvalue().encode()
 
 

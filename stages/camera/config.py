@@ -35,6 +35,13 @@ class CameraConfig:
     """Send only every so many-th frame, at its own time."""
     frames: int | None = None
     """Stop after so many."""
+    objects: tuple[str, ...] = ()
+    """All objects that are looked for in its frames, where they are several: a frame is answered once each of them has
+    answered."""
+    truth_of: str | None = None
+    """Of several objects that whose poses the source knows, where it knows true poses (default: the first)."""
+    recorded: str | None = None
+    """OBJECT/CAMERA: which of a recording's frames to send, where it holds several."""
     answer_timeout_s: float = 15.0
     """Without a sign of life of a frame for so long, lockstep goes on and the end of the source is the end."""
     progress_file: Path | None = None

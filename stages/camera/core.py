@@ -79,8 +79,10 @@ class Feed:
         self._exhausted = False
         self._start: tuple[int, int] | None = None
         self._sent = 0
+        self._objects: tuple[str | None, ...] = config.objects or (None,)
         self._awaited: int | None = None
-        self._in_flight = 0
+        self._unheard: set[str | None] = set()
+        self._in_flight: dict[str | None, int] = {}
         self._last_sign_ns = 0
         self.unanswered = 0
 
@@ -110,18 +112,20 @@ class Feed:
         if frame_id == self._awaited:
             self._last_sign_ns = now_ns
 
-    def answered(self, frame_id: int, in_flight: int, now_ns: int) -> None:
-        """Tracking is done with that frame, and has `in_flight` others left."""
+    def answered(self, frame_id: int, in_flight: int, now_ns: int, object: str | None = None) -> None:
+        """Tracking of an object is done with that frame, and has `in_flight` others left."""
         self.sign_of_life(frame_id, now_ns)
-        self._in_flight = in_flight
+        self._in_flight[object] = in_flight
         if frame_id == self._awaited:
-            self._awaited = None
+            self._unheard.discard(object)
+            if not self._unheard:
+                self._awaited = None
 
     def over(self, now_ns: int) -> bool:
         """Whether the source has ended, and the last frame is answered or will not be."""
         if not self._exhausted:
             return False
-        return (self._awaited is None and self._in_flight == 0) or self._silent(now_ns)
+        return (self._awaited is None and not any(self._in_flight.values())) or self._silent(now_ns)
 
     def close(self) -> None:
         """Let go of the source's files and devices."""
@@ -161,5 +165,5 @@ class Feed:
     def _note_sent(self, frame: CapturedFrame, now_ns: int) -> None:
         self._next = None
         self._sent += 1
-        self._awaited = frame.frame_id
+        self._awaited, self._unheard = frame.frame_id, set(self._objects)
         self._last_sign_ns = now_ns

@@ -16,7 +16,7 @@ from fieldpose.stages.geometry import Camera
 
 
 class CameraNode:
-    """A Handler that ends by itself, once the last frame of its source is answered.
+    """A Handler that ends by itself, once the last frame of its source is answered, by every object of config.objects.
 
     `known` gives the cameras of the training views. `wait_until_ready` is called before the first frame, for instance
     to wait for the stages that will work on it. Raises FieldposeErrors at start, and at stop the one that ended the
@@ -35,15 +35,21 @@ class CameraNode:
         self._wait_until_ready = wait_until_ready
         self._sender: Sender | None = None
 
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """All objects that are looked for in its frames, where they are several."""
+        return self._config.objects
+
     def start(self) -> None:
         self._sender = Sender(self._config, self._known())
         stage_logger(self.name).info("source", what=self._sender.description)
         self._wait_until_ready()
 
     def handle(self, topic: Topic[Any], message: Message) -> Iterable[Output]:
-        now_ns = time.time_ns()
-        self._opened.heard(message, now_ns)
-        return self.tick(now_ns)  # or an answer would wait up to 20 ms for the next frame
+        return self._heard(message)
+
+    def handle_of(self, object: str, topic: Topic[Any], message: Message) -> Iterable[Output]:
+        return self._heard(message, object)
 
     def tick_in_s(self, now_ns: int) -> float:
         """A frame goes out when it is due, not at the next beat after that."""
@@ -58,6 +64,11 @@ class CameraNode:
     def stop(self) -> None:
         if self._sender is not None:
             self._sender.close()
+
+    def _heard(self, message: Message, object: str | None = None) -> Iterable[Output]:
+        now_ns = time.time_ns()
+        self._opened.heard(message, now_ns, object)
+        return self.tick(now_ns)  # or an answer would wait up to 20 ms for the next frame
 
     @property
     def _opened(self) -> Sender:

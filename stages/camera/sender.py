@@ -38,10 +38,10 @@ class Sender:
         """How long until the next frame is due; None where that is not known."""
         return self._feed.wait_s(now_ns)
 
-    def heard(self, message: Message, now_ns: int) -> None:
-        """Take in a State, Pose or Failure: a frame is answered, or a pass over it has come back."""
+    def heard(self, message: Message, now_ns: int, object: str | None = None) -> None:
+        """Take in a State, Pose or Failure of an object: a frame is answered, or a pass over it has come back."""
         if isinstance(message, State):
-            self._feed.answered(message.header.frame_id, message.in_flight, now_ns)
+            self._feed.answered(message.header.frame_id, message.in_flight, now_ns, object)
         else:
             self._feed.sign_of_life(message.header.frame_id, now_ns)
 

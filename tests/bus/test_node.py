@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -73,6 +74,20 @@ class Plain:
 
     def stop(self) -> None:
         self.stopped += 1
+
+
+class Several(Plain):
+    """A handler that hears the guesses of two objects, and tells whose each is."""
+
+    outputs: tuple[Topic[Any], ...] = (PRIOR,)
+
+    def __init__(self, *objects: str) -> None:
+        super().__init__(lambda topic, message: self.handle_of("itself", topic, message))
+        self.objects, self.heard = objects, list[tuple[str, int]]()
+
+    def handle_of(self, object: str, topic: Topic[Any], message: Message) -> Iterable[Output]:
+        self.heard.append((object, message.header.frame_id))
+        return [(PRIOR, prior(message.header.frame_id))]
 
 
 @contextmanager
@@ -340,6 +355,25 @@ class TestFailures:
 
 
 class TestPlain:
+    def test_one_that_hears_several_objects_is_told_whose_a_message_is_and_hears_no_others(self) -> None:
+        bus, handler = MemoryBus(), Several("mug", "bowl")
+        inbox = listen(bus, PRIOR)
+        with running(handler, bus):
+            for i, name in enumerate(("bowl", "cup", "mug", "bowl")):
+                Outbox(bus, replace(ADDRESS, object=name), "test").publish(GUESS, guess(i))
+            answered = [inbox.get(5.0) for _ in range(3)]
+        assert handler.heard == [("bowl", 0), ("mug", 2), ("bowl", 3)]
+        assert {each.key for each in answered if each is not None} == {ADDRESS.key(PRIOR)}
+
+    def test_one_that_might_and_is_told_of_none_hears_its_own(self) -> None:
+        bus, handler = MemoryBus(), Several()
+        inbox = listen(bus, PRIOR)
+        with running(handler, bus):
+            for i, name in enumerate(("bowl", "mug")):
+                Outbox(bus, replace(ADDRESS, object=name), "test").publish(GUESS, guess(i))
+            assert inbox.get(5.0) is not None
+        assert handler.heard == [("itself", 1)]
+
     def test_a_message_is_handled_at_once(self) -> None:
         bus = MemoryBus()
         delays_ms: list[float] = []

@@ -202,6 +202,16 @@ class TestContract:
         with pytest.raises(TransportError, match=r"after 0\.1 s: camera, lifting; is"):
             wait_for(ours, ADDRESS, ["lifting", "pnp", "camera"], 0.1)
 
+    def test_stages_of_other_pipelines_are_waited_for_by_their_object_and_camera(self, sessions: Sessions) -> None:
+        ours, theirs = sessions
+        for address in (ADDRESS, Address("test", "bowl", "left"), Address("elsewhere", "bowl", "right")):
+            theirs.hold(address.live("pnp"))
+        wait_for(ours, ADDRESS, ["pnp", "bowl/left/pnp"], 5.0)
+        with pytest.raises(TransportError, match=r"after 0\.1 s: bowl/right/pnp; is"):
+            wait_for(ours, ADDRESS, ["pnp", "bowl/left/pnp", "bowl/right/pnp"], 0.1)
+        with pytest.raises(TransportError, match="expected STAGE or OBJECT/CAMERA/STAGE"):
+            wait_for(ours, ADDRESS, ["left/pnp"], 0.1)
+
     def test_a_late_stage_is_waited_for(self, sessions: Sessions) -> None:
         ours, theirs = sessions
         threading.Timer(0.1, theirs.hold, (ADDRESS.live("late"),)).start()
@@ -213,6 +223,9 @@ class TestKeys:
     def test_stats_keys_name_the_stage(self) -> None:
         assert ADDRESS.key(STATS, "pnp") == "test/stats/mug/cam/pnp"
         assert STATS.address_of("test/stats/mug/cam/pnp") == ADDRESS
+        assert all(ADDRESS.covers(key) for key in ("test/stats/mug/cam/pnp", "test/camera/cam/frame"))
+        others = ("test/camera/cam2/frame", "test/stats/bowl/cam/pnp", "test/track")
+        assert not any(ADDRESS.covers(key) for key in others)
 
     def test_every_key_leads_back_to_its_topic_alone(self) -> None:
         keys = {topic: ADDRESS.key(topic, "pnp") for topic in ALL}

@@ -67,7 +67,7 @@ def test_each_command_describes_itself_with_an_example(name: str, capsys: pytest
         (["runn"], "no command 'runn'; expected one of demo, train"),
         (["run", "f", "--nonsense", "3"], "Unrecognized options: --nonsense"),
         (["run", "f", "--tracking.deth", "3"], "did you mean --tracking.depth?"),
-        (["run"], "PATH"),
+        (["run"], "no field; give one, or several"),
         (["run", "f", "--depth", "many"], "--depth"),
         (["stage", "cooking"], "'cooking'"),
         (["info", "nothing.mcap"], "nothing.mcap: cannot be read: No such file"),
@@ -144,7 +144,8 @@ def test_short_flags_are_the_long_ones(tmp_path: Path) -> None:
     short = ["--source", "folder:x", "--guess", "train:a", "--size", "64", "--pace", "fast", "--passes", "2"]
     options = parse(run.Options, "run", ["f", *short, "--matcher", "sift", "--refine", "never"])
     settings = options.with_shortcuts()
-    assert (settings.camera.source, settings.camera.size, settings.camera.pace) == ("folder:x", 64, "fast")
+    assert (options.field, options.source) == (("f",), ("folder:x",))
+    assert (settings.camera.size, settings.camera.pace) == (64, "fast")
     assert (settings.tracking.guess, settings.tracking.passes) == ("train:a", 2)
     assert settings.matching.matcher == "sift"
     assert settings.refinement.when == "never"

@@ -20,7 +20,7 @@ from fieldpose.deploy.graph import BY_NAME, threads_of
 from fieldpose.deploy.local import LocalPipeline, PoseFinder
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan
-from fieldpose.deploy.processes.pipeline import Run, run_pipeline
+from fieldpose.deploy.processes.pipeline import run_pipeline
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import Settings, changed
 from fieldpose.stages.nerf.datasets import load_dataset
@@ -73,7 +73,7 @@ def assert_same(these: Sequence[State], those: Sequence[State]) -> None:
 def test_both_ways_give_the_same_poses_of_a_video_to_the_last_bit(tmp_path: Path) -> None:
     plan = planned(changed(Settings(), VIDEO, "test"), FIELD)
     here = in_one_process(plan)
-    run_pipeline(Run(plan, tmp_path / "run.mcap"))
+    run_pipeline(plan, record=tmp_path / "run.mcap")
     assert sum(state.cam_from_object is not None for state in here) >= len(here) - 1
     assert_same(here, states_in(tmp_path / "run.mcap"))
 

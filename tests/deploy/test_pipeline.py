@@ -7,7 +7,9 @@ import os
 import signal
 import subprocess
 import time
+from collections.abc import Sequence
 from contextlib import nullcontext
+from itertools import takewhile
 from pathlib import Path
 
 import psutil
@@ -17,9 +19,21 @@ from support.commands import command
 from fieldpose.bus.replay import info
 from fieldpose.bus.topics import ALL
 from fieldpose.deploy.cli import main
-from fieldpose.deploy.graph import BY_NAME, CAMERA, HUB, OBSERVER, RECORDER, STAGES, thread_environment, threads_of
+from fieldpose.deploy.graph import (
+    BY_NAME,
+    CAMERA,
+    GRAPH,
+    HUB,
+    OBSERVER,
+    RECORDER,
+    STAGES,
+    thread_environment,
+    threads_of,
+)
 from fieldpose.deploy.plan import resolve
-from fieldpose.deploy.processes.pipeline import Progress, Run, programs
+from fieldpose.deploy.processes.pipeline import Progress
+from fieldpose.deploy.processes.programs import programs
+from fieldpose.deploy.processes.supervision import Program
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import Settings, changed
 
@@ -43,21 +57,63 @@ def pid_of(stage: str) -> int:
     raise AssertionError(f"{stage} is not running")
 
 
+def of(made: Sequence[Program], name: str, flag: str) -> list[str]:
+    """What a program is given for a flag."""
+    words = list(next(program for program in made if program.name == name).command)
+    after = words[words.index(flag) + 1 :] if flag in words else []
+    return list(takewhile(lambda word: not word.startswith("--"), after))
+
+
 def test_a_run_has_every_process_that_its_plan_wants(tmp_path: Path) -> None:
     plan = resolve(changed(Settings(), {"tracking": {"guess": "perturb:4-8deg,0.05"}}, "test"), None, Path("field"))
-    run = Run(plan, record=tmp_path / "a.mcap")
-    made = {program.name: program for program in programs(run, tmp_path, "tcp/127.0.0.1:1")}
-    assert set(made) == set(BY_NAME) == {HUB, RECORDER, *STAGES}
-    assert made[CAMERA].ends
-    assert not any(program.ends for name, program in made.items() if name != CAMERA)
-    waits = made[CAMERA].command[list(made[CAMERA].command).index("--wait-for") + 1 :]
-    assert set(waits) == {OBSERVER, RECORDER, *STAGES} - {CAMERA}
-    assert "--record" not in made["matching"].command
-    assert made["matching"].environment["OMP_NUM_THREADS"] == made["matching"].environment["NUMBA_NUM_THREADS"]
-    alone = changed(Settings(), {"retrieval": {"candidates": 0}}, "test")
-    without = Run(resolve(alone, None, Path("field")))
-    named = {program.name for program in programs(without, tmp_path, "tcp/127.0.0.1:1")}
+    made = programs([plan], tmp_path, "tcp/127.0.0.1:1", tmp_path / "a.mcap")
+    assert {program.name for program in made} == set(BY_NAME) == {HUB, RECORDER, *STAGES}
+    assert [program.name for program in made if program.ends] == [CAMERA]
+    assert set(of(made, CAMERA, "--wait-for")) == {OBSERVER, RECORDER, *STAGES} - {CAMERA}
+    assert of(made, "matching", "--wait-for") == [OBSERVER, RECORDER]
+    assert (of(made, RECORDER, "--record"), of(made, "matching", "--record")) == ([str(tmp_path / "a.mcap")], [])
+    matching = next(program for program in made if program.name == "matching")
+    assert matching.environment["OMP_NUM_THREADS"] == matching.environment["NUMBA_NUM_THREADS"]
+    alone = resolve(changed(Settings(), {"retrieval": {"candidates": 0}}, "test"), None, Path("field"))
+    named = {program.name for program in programs([alone], tmp_path, "tcp/127.0.0.1:1", None)}
     assert named == set(BY_NAME) - {RECORDER, "perturbation", "retrieval"}
+
+
+def test_of_several_pipelines_most_processes_serve_all_and_wait_for_those_of_their_camera(tmp_path: Path) -> None:
+    plans = [
+        resolve(
+            changed(
+                Settings(),
+                {
+                    "address": {"object": object, "camera": camera},
+                    "camera": {"objects": ("lamp", "can"), "truth_of": "can" if camera == "right" else None},
+                },
+                "test",
+            ), None, Path(f"{object}.safetensors"),
+        )
+        for camera in ("left", "right") for object in ("lamp", "can")
+    ]  # fmt: skip
+    made = programs(plans, tmp_path, "tcp/127.0.0.1:1", tmp_path / "a.mcap")
+    shared = {row.name for row in GRAPH if row.serves == "run"}
+    assert shared == set(BY_NAME) - {CAMERA, "tracking", "perturbation"}
+    pairs = [f"{object}@{camera}" for camera in ("left", "right") for object in ("lamp", "can")]
+    each = {f"tracking@{pair}" for pair in pairs}
+    assert {program.name for program in made} == {*shared, *each, f"{CAMERA}@left", f"{CAMERA}@right"}
+    assert {program.name for program in made if program.ends} == {f"{CAMERA}@left", f"{CAMERA}@right"}
+    waits = set(of(made, f"{CAMERA}@left", "--wait-for"))
+    stages = set(STAGES) - {CAMERA, "perturbation"}
+    assert waits == {OBSERVER, RECORDER, *stages, *(f"can/left/{stage}" for stage in stages)}
+    # This camera is at home with the object whose true poses it knows.
+    waits = set(of(made, f"{CAMERA}@right", "--wait-for"))
+    listeners = {f"lamp/left/{name}" for name in (OBSERVER, RECORDER)}
+    assert waits == {*listeners, *stages, *(f"lamp/right/{stage}" for stage in stages)}
+    assert of(made, "tracking@can@right", "--wait-for") == [f"lamp/left/{name}" for name in (OBSERVER, RECORDER)]
+    (file,) = {tuple(of(made, name, "--pipelines")) for name in shared - {HUB}}
+    listed = json.loads(Path(file[0]).read_text())
+    assert [Path(one["field"]).stem for one in listed] == ["lamp", "can", "lamp", "can"]
+    assert len({one["settings"] for one in listed}) == 4
+    assert of(made, "tracking@can@right", "--config") == [listed[3]["settings"]]
+    assert {*stages, CAMERA, RECORDER, HUB} == set(listed[0]["processes"])
 
 
 def test_threads_are_shared_between_the_processes_at_work() -> None:
@@ -76,7 +132,7 @@ def test_a_stage_killed_in_the_demo_comes_back_and_the_recording_is_whole(
     before = descendants()
 
     def kill_rendering(progress: Progress) -> None:
-        if not killed and progress.state is not None and progress.state.finished >= 2:
+        if not killed and any(one.state is not None and one.state.finished >= 2 for one in progress.standings):
             killed.append(pid_of("rendering"))
             os.kill(killed[0], signal.SIGKILL)
 

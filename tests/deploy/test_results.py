@@ -85,7 +85,11 @@ def test_lost_messages_are_those_the_numbers_lack_or_only_the_command_has_heard(
 
 def test_the_rows_hold_pose_and_errors() -> None:
     certain = replace(result(3, 2.0, 0.0), covariance=np.diag([1e-4, 0, 0, np.deg2rad(0.5) ** 2, 0, 0]))
-    rows = list(csv.DictReader(io.StringIO(to_csv([certain, result(4, None)]).decode())))
+    written = to_csv([(ADDRESS, [certain, result(4, None)]), (Address(object="bowl", camera="left"), [result(5, 1.0)])])
+    rows = list(csv.DictReader(io.StringIO(written.decode())))
+    assert [(row["frame_id"], row["object"], row["camera_name"]) for row in rows] == [
+        ("3", ADDRESS.object, ADDRESS.camera), ("4", ADDRESS.object, ADDRESS.camera), ("5", "bowl", "left"),
+    ]  # fmt: skip
     assert float(rows[0]["sigma_translation"]) == pytest.approx(0.01)
     assert float(rows[0]["sigma_rotation_deg"]) == pytest.approx(0.5)
     assert rows[1]["sigma_translation"] == ""

@@ -12,7 +12,7 @@ from cachetools import FIFOCache
 
 from fieldpose.bus.messages import Frame, Truth
 from fieldpose.bus.replay import Recorded, read_recording
-from fieldpose.bus.topics import FRAME, TRUTH
+from fieldpose.bus.topics import FRAME, TRUTH, Address, key_matches
 from fieldpose.errors import RecordingError, SourceError
 from fieldpose.stages.camera.calibration import Calibrator
 from fieldpose.stages.camera.config import CameraConfig
@@ -25,18 +25,30 @@ _TRUTHS_KEPT = 64
 
 
 def open_recording(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
-    """mcap:FILE, which holds its cameras. Raises SourceError for one without frames, or with several cameras."""
+    """mcap:FILE, which holds its cameras: config.recorded says whose frames, where these are several.
+
+    Raises SourceError for one without frames of it.
+    """
+    wanted = None if config.recorded is None else _address(config.recorded)
 
     def frames(first: int) -> Iterator[CapturedFrame]:
-        return islice(_frames(rest, config.size), first, None)
+        return islice(_frames(rest, config.size, wanted), first, None)
 
     if next(frames(0), None) is None:
-        raise SourceError(f"{rest}: no camera frames in this recording; `fieldpose info` lists what it has")
+        which = "" if config.recorded is None else f" of {config.recorded}"
+        raise SourceError(f"{rest}: no camera frames{which} in this recording; `fieldpose info` lists what it has")
     return Source(f"recording {rest}", "own", frames)
 
 
-def _frames(path: str, size: int | None) -> Iterator[CapturedFrame]:
-    for frame, truth in _with_truths(path):
+def _address(recorded: str) -> Address:
+    object, slash, camera = recorded.partition("/")
+    if not (object and slash and camera) or "*" in recorded:
+        raise SourceError(f"camera: recorded is {recorded!r}: expected OBJECT/CAMERA, for instance object/camera0")
+    return Address("*", object, camera)
+
+
+def _frames(path: str, size: int | None, wanted: Address | None) -> Iterator[CapturedFrame]:
+    for frame, truth in _with_truths(path, wanted):
         camera, header = frame.camera, frame.header
         known = None if truth is None else TruePose(truth.cam_from_object)
         image, encoding = frame.image, frame.encoding
@@ -49,11 +61,11 @@ def _frames(path: str, size: int | None) -> Iterator[CapturedFrame]:
         )
 
 
-def _with_truths(path: str) -> Iterator[tuple[Frame, Truth | None]]:
+def _with_truths(path: str, wanted: Address | None) -> Iterator[tuple[Frame, Truth | None]]:
     """Each frame with its truth, which may stand a little before or after it in the file."""
     waiting: deque[Frame] = deque()
     truths: FIFOCache[int, Truth] = FIFOCache(_TRUTHS_KEPT)
-    for recorded in _messages(path):
+    for recorded in _messages(path, wanted):
         if recorded.topic is TRUTH:
             truths[recorded.message.header.frame_id] = cast(Truth, recorded.message)
         else:
@@ -65,13 +77,15 @@ def _with_truths(path: str) -> Iterator[tuple[Frame, Truth | None]]:
         yield frame, truths.pop(frame.header.frame_id, None)
 
 
-def _messages(path: str) -> Iterator[Recorded]:
+def _messages(path: str, wanted: Address | None) -> Iterator[Recorded]:
     keys: dict[str, str] = {}
     try:
         for recorded in read_recording(path, (FRAME, TRUTH)):
+            if wanted is not None and not key_matches(wanted.key(recorded.topic), recorded.key):
+                continue
             if keys.setdefault(recorded.topic.name, recorded.key) != recorded.key:
                 both = f"{keys[recorded.topic.name]} and {recorded.key}"
-                raise SourceError(f"{path}: holds {both}; a source is one camera and one object")
+                raise SourceError(f"{path}: holds {both}; choose one with --camera.recorded OBJECT/CAMERA")
             yield recorded
     except RecordingError as error:
         raise SourceError(str(error)) from error

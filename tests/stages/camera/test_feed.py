@@ -105,6 +105,22 @@ def test_photos_go_in_lockstep_with_the_answers_and_the_time_of_sending() -> Non
     assert sent(photos, 6200) == []
 
 
+def test_a_frame_of_several_objects_is_answered_once_all_of_them_have_answered() -> None:
+    photos = feed("none", count=2, objects=("lamp", "can"))
+    assert sent(photos, 0) == [(0, 0)]
+    photos.answered(0, 0, START, "lamp")
+    photos.answered(0, 0, START, "lamp")
+    assert sent(photos, 10) == []
+    photos.answered(0, 0, START, "can")
+    assert sent(photos, 20) == [(1, 20)]
+    photos.answered(1, 0, START + 30 * MS, "can")
+    photos.answered(1, 1, START + 30 * MS, "lamp")
+    assert not photos.over(START + 40 * MS)
+    photos.answered(0, 0, START + 50 * MS, "lamp")
+    assert sent(photos, 50) == []
+    assert photos.over(START + 50 * MS)
+
+
 def test_a_video_in_lockstep_keeps_its_own_times() -> None:
     video = feed("own", pace="lockstep")
     captured = []

@@ -314,8 +314,32 @@ def test_a_recording_of_two_cameras_is_not_mixed(tmp_path: Path) -> None:
         writer.write(Address(camera=camera).key(FRAME), FRAME, frame, i)
     writer.close()
     assert len(frames_of(f"mcap:{path}")) == 1
-    with pytest.raises(SourceError, match="one camera"):
-        frames_of(f"mcap:{tmp_path / 'two.mcap'}")
+    two = f"mcap:{tmp_path / 'two.mcap'}"
+    with pytest.raises(SourceError, match=r"choose one with --camera\.recorded OBJECT/CAMERA"):
+        frames_of(two)
+    assert [frame.frame_id for frame in frames_of(two, recorded="object/right")] == [1]
+    wrongs = {"object/back": "no camera frames of object/back", "right": "expected OBJECT/CAMERA"}
+    for wrong, complaint in wrongs.items():
+        with pytest.raises(SourceError, match=complaint):
+            frames_of(two, recorded=wrong)
+
+
+def test_a_recording_of_two_objects_gives_the_truths_of_the_one_that_is_chosen(tmp_path: Path) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap")
+    camera, header = Camera(48, 32, 50.0, 50.0, 23.5, 15.5), first_header(0, 0)
+    writer.write(Address().key(FRAME), FRAME, Frame(header=header, image=shade(0), encoding="rgb8", camera=camera), 0)
+    for shift, name in enumerate(("lamp", "can")):
+        pose = np.eye(4)
+        pose[2, 3] = 1 + shift
+        writer.write(Address(object=name).key(TRUTH), TRUTH, Truth(header=header, cam_from_object=pose), 0)
+    writer.close()
+    for name, depth in (("lamp", 1), ("can", 2)):
+        (frame,) = frames_of(f"mcap:{tmp_path / 'a.mcap'}", recorded=f"{name}/camera0")
+        assert frame.truth is not None
+        assert frame.truth.cam_from_object is not None
+        assert frame.truth.cam_from_object[2, 3] == depth
+    (frame,) = frames_of(f"mcap:{tmp_path / 'a.mcap'}", recorded="cup/camera0")
+    assert frame.truth is None
 
 
 def broken_sources(root: Path) -> dict[str, tuple[str, str]]:

@@ -15,9 +15,8 @@ from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
 from fieldpose.deploy.processes.endpoints import peer_address
 from fieldpose.errors import GeometryError
 from fieldpose.stages.camera.wire import frame_messages
-from fieldpose.stages.geometry import Camera, is_rigid
+from fieldpose.stages.geometry import RIGID_TOLERANCE, Camera, is_rigid
 from fieldpose.stages.images import checked_image
-from fieldpose.stages.tracking.wire import RIGID_TOLERANCE
 
 _POLL_S = 0.1
 _KEPT_STATES = 1024

@@ -24,6 +24,11 @@ class Request(Checked, kw_only=True, tag_field="request"):
 
     version: int = VERSION
 
+    @property
+    def kind(self) -> str:
+        """Its name on the wire."""
+        return str(self.__struct_config__.tag)
+
 
 class Reset(Request, kw_only=True, tag="reset"):
     """Forget what is believed of the camera, and begin again as this run has begun."""
@@ -69,7 +74,7 @@ class ControlValues(Checked, kw_only=True):
     state: of the newest frame, INITIALIZING before the first and after a reset. frames: how many have come; requests:
     how many that change something were carried out. solves_per_s: how often a frame is solved at least, at most 100;
     None where frames are not followed. begins_at: (4, 4) where tracking begins when nothing is known of the camera;
-    None where training views are tried, and where frames have guesses of their own.
+    None where training views are tried, and where frames stand each by itself.
     """
 
     version: int = VERSION

@@ -65,7 +65,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Progress:
-    """What a run is doing, for people to look at; `pids`: its processes by name."""
+    """What a run is doing, for people to look at; `pids`: its processes by name; `hub`: where others can join it."""
 
     phase: Literal["starting", "running", "finishing"]
     waiting_for: tuple[str, ...] = ()
@@ -74,6 +74,7 @@ class Progress:
     state: State | None = None
     restarts: int = 0
     pids: Mapping[str, int] = field(default_factory=dict)
+    hub: str = ""
 
 
 Report = Callable[[Progress], None]
@@ -174,7 +175,7 @@ class _Running:
                 break
             if time.monotonic() > deadline:
                 raise ProcessError(f"not ready after {_START_S:g} s: {', '.join(waiting)}")
-            self._report(Progress("starting", waiting))
+            self._report(Progress("starting", waiting, hub=self._hub))
             self._stop.wait(_POLL_S)
         watching.close()
         self._limit = _RESTARTS

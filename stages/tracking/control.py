@@ -41,7 +41,10 @@ class Controls:
         """Do what is asked; how things are then, and what is to be sent. Raises RefusedError, and changes nothing."""
         if isinstance(request, Show):
             return self._values(), []
-        done, said = self._done(request, now_ns)
+        try:
+            done, said = self._done(request, now_ns)
+        except RefusedError as error:
+            raise RefusedError(f"{request.kind}: {error}") from None
         self._requests += 1
         return self._values(), [(CONTROL, done), *outputs_of(self.note(said))]
 
@@ -60,7 +63,7 @@ class Controls:
             case SetSolving():
                 tracker.solve_at_least(request.solves_per_s)
                 return self._accepted("set_solving", now_ns, solves_per_s=request.solves_per_s), []
-        raise RefusedError(f"tracking takes no {type(request).__name__}")
+        raise RefusedError("tracking takes no such request")
 
     def _accepted(
         self, request: Changes, now_ns: int, pose: np.ndarray | None = None, solves_per_s: float | None = None

@@ -58,7 +58,7 @@ def test_every_request_comes_back(request_: Request) -> None:
 
 
 def test_there_is_a_sample_of_every_kind() -> None:
-    assert [wire(sample)["request"] for sample in SAMPLES] == list(KINDS)
+    assert [wire(sample)["request"] for sample in SAMPLES] == [sample.kind for sample in SAMPLES] == list(KINDS)
     assert [type(sample) for sample in SAMPLES] == list(KINDS.values())
 
 

@@ -13,10 +13,10 @@ import msgpack
 import msgspec
 import numpy as np
 
-from fieldpose.bus.messages import Header, Message
+from fieldpose.bus.messages import Checked, Header
 from fieldpose.errors import CodecError
 
-M = TypeVar("M", bound=Message)
+M = TypeVar("M", bound=Checked)
 
 DTYPES = {
     name: np.dtype(name).newbyteorder("<")
@@ -32,7 +32,7 @@ _HEADER_BYTES = 1024
 _ARRAY_KEYS = {"dtype", "shape", "data"}
 
 
-def encode(message: Message) -> bytes:
+def encode(message: Checked) -> bytes:
     """Pack a message, checking it as the receiver will. Raises CodecError where it cannot be sent."""
     try:
         message.__post_init__()
@@ -47,14 +47,25 @@ def decode(payload: bytes | memoryview, message_type: type[M], max_bytes: int = 
 
     Raises CodecError for anything that is not exactly one valid `message_type` of at most `max_bytes`.
     """
-    name = message_type.__name__
+    return converted(unpacked(payload, message_type.__name__, max_bytes), message_type)
+
+
+def unpacked(payload: bytes | memoryview, name: str, max_bytes: int) -> Any:
+    """The bare value, not checked yet. Raises CodecError, which begins with `name`, for anything that is not one."""
     if len(payload) > max_bytes:
         raise CodecError(f"{name}: {len(payload)} bytes where at most {max_bytes} are allowed")
     try:
-        fields = _unpack(payload, max_bytes)
-        return msgspec.convert(fields, message_type, strict=True, dec_hook=_array_from_wire)
-    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
+        return _unpack(payload, max_bytes)
+    except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
         raise CodecError(f"{name}: {_one_line(error)}") from error
+
+
+def converted(fields: Any, message_type: type[M]) -> M:
+    """A checked message from its bare fields. Raises CodecError for what is not exactly one valid `message_type`."""
+    try:
+        return msgspec.convert(fields, message_type, strict=True, dec_hook=_array_from_wire)
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise CodecError(f"{message_type.__name__}: {_one_line(error)}") from error
 
 
 def decode_header(payload: bytes) -> Header:

@@ -8,7 +8,16 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from fieldpose.bus.protocol import Closer, Closing, Sink, Watcher
+from fieldpose.bus.protocol import (
+    Answer,
+    Closer,
+    Closing,
+    Replies,
+    Sink,
+    Watcher,
+    nobody_answers,
+    refusal,
+)  # fmt: skip
 from fieldpose.bus.topics import Topic, key_matches
 
 T = TypeVar("T")
@@ -16,12 +25,13 @@ T = TypeVar("T")
 
 @dataclass
 class _Room:
-    """What MemoryBus sessions share; sinks and watchers are called from the thread that puts."""
+    """What MemoryBus sessions share; sinks, watchers and answers are called from the thread that puts or asks."""
 
     lock: threading.RLock = field(default_factory=threading.RLock)
     sinks: list[tuple[str, Sink]] = field(default_factory=list)
     tokens: list[str] = field(default_factory=list)
     watchers: list[tuple[str, Watcher]] = field(default_factory=list)
+    served: list[tuple[str, Answer]] = field(default_factory=list)
 
 
 class MemoryBus:
@@ -40,6 +50,23 @@ class MemoryBus:
 
     def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:
         return self._enter(self._room.sinks, (key, sink))
+
+    def serve(self, key: str, answer: Answer) -> Closing:
+        return self._enter(self._room.served, (key, answer))
+
+    def ask(self, key: str, payload: bytes, timeout_s: float) -> Replies:
+        with self._room.lock:
+            served = [(name, answer) for name, answer in self._room.served if key_matches(key, name)]
+        answers: dict[str, bytes] = {}
+        refusals: list[str] = []
+        for name, answer in served:
+            try:
+                answers[name] = answer(payload)
+            except Exception as error:
+                refusals.append(refusal(name, error))
+        if not served:
+            raise nobody_answers(key, timeout_s)
+        return Replies(answers, tuple(refusals))
 
     def hold(self, key: str) -> Closing:
         with self._room.lock:

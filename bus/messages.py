@@ -34,6 +34,7 @@ class Reason(StrEnum):
     NO_ANSWER = "no_answer"
     NO_GUESS = "no_guess"
     INTERNAL_ERROR = "internal_error"
+    RESET = "reset"
 
 
 class GuessReason(StrEnum):
@@ -65,6 +66,7 @@ class CameraOrigin(StrEnum):
 
 
 Encoding = Literal["rgb8", "jpeg", "png"]
+Changes = Literal["reset", "set_guess", "set_solving"]
 
 
 class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -90,12 +92,10 @@ class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.frame_id, self.capture_ns
 
 
-class Message(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
-    """Base of all messages; `_arrays` maps a field to its (dtype, shape), None where any length will do."""
+class Checked(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
+    """What checks itself; `_arrays` maps a field to its (dtype, shape), None where any length will do."""
 
     _arrays: ClassVar[dict[str, tuple[str, tuple[int | None, ...]]]] = {}
-
-    header: Header
 
     def __post_init__(self) -> None:
         for name, (dtype, shape) in self._arrays.items():
@@ -106,6 +106,12 @@ class Message(msgspec.Struct, kw_only=True, forbid_unknown_fields=True):
             value = getattr(self, name)
             if isinstance(value, float) and not math.isfinite(value):
                 raise ValueError(f"{name}: not finite")
+
+
+class Message(Checked, kw_only=True):
+    """Base of all messages on topics."""
+
+    header: Header
 
 
 def check_equal(what: str, sizes: dict[str, Any]) -> None:
@@ -350,10 +356,25 @@ class State(Message, kw_only=True):
     _arrays: ClassVar = {"cam_from_object": POSE, "covariance": COVARIANCE}
 
 
+class Control(Message, kw_only=True):
+    """What tracking was asked for from outside, and has done, at the header's capture time.
+
+    after_frame: the newest frame that had come by then; None before the first. cam_from_object: the guess that was set;
+    solves_per_s: how often frames are solved at least from here on.
+    """
+
+    request: Changes
+    after_frame: int | None
+    cam_from_object: np.ndarray | None
+    solves_per_s: float | None
+    _arrays: ClassVar = {"cam_from_object": POSE}
+
+
 class Stats(Message, kw_only=True):
     """Counters of one process since it started; sent from its main loop, so that it is the heartbeat as well.
 
-    `gaps` are messages that should have come and did not; `skipped` those that a newest-only input let go.
+    `refused` are payloads that were no message, and requests that were not carried out. `gaps` are messages that should
+    have come and did not; `skipped` those that a newest-only input let go.
     `busy_s` is what all calls that answered took, `busy_ms_` what the newest of them did.
     """
 

@@ -1,164 +1,41 @@
 """The life of a process: subscribe -> handle -> publish, with counters, heartbeat, liveliness token and signals.
 
-A stage implements Handler, or JoinedHandler where it needs several inputs of a frame; `run_node` does the rest.
+A stage implements what stands in `handlers`; `run_node` does the rest.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-import traceback
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import psutil
 
-from fieldpose.bus.joining import Joined, Joiner, kept
-from fieldpose.bus.logs import Throttle, stage_logger
+from fieldpose.bus.control import Desk
+from fieldpose.bus.handlers import Controlled, EndOfInput, Handler, HearsObjects, JoinedHandler, KeepsTime, Output
+from fieldpose.bus.joining import Joined, kept
+from fieldpose.bus.logs import Throttle, describe, stage_logger
 from fieldpose.bus.messages import Failure, Message, Reason, Stats
 from fieldpose.bus.ports import Inbox, InboxCounts, Outbox, Received, first_header, reply_header
 from fieldpose.bus.protocol import SETTLE_S, Bus, Closing
+from fieldpose.bus.requests import ControlValues, Request
 from fieldpose.bus.signals import Interrupted, StopSignals
-from fieldpose.bus.topics import FAILURE, FRAME, STATS, Address, Topic
-from fieldpose.errors import CodecError
+from fieldpose.bus.topics import FAILURE, STATS, Address, Topic
+from fieldpose.errors import CodecError, FieldposeError
 
 __all__ = [
-    "EndOfInput", "Handler", "Joined", "JoinedHandler", "Output", "first_header", "reply_header", "run_node",
-    "run_nodes",
+    "Controlled", "EndOfInput", "Handler", "HearsObjects", "Joined", "JoinedHandler", "KeepsTime", "Output",
+    "first_header", "reply_header", "run_node", "run_nodes",
 ]  # fmt: skip
-
-Output = tuple[Topic[Any], Message]
 
 TICK_S = 0.02
 STATS_PERIOD_S = 0.5
 _BUSY_WINDOW = 256
-
-
-class EndOfInput(Exception):  # noqa: N818 - as StopIteration, it is no failure
-    """Raised by a handler that has nothing more to send: its process ends cleanly."""
-
-
-class Handler(Protocol):
-    """What a stage does; all methods are called from one thread."""
-
-    @property
-    def name(self) -> str:
-        """The process's name on the bus."""
-
-    @property
-    def inputs(self) -> tuple[Topic[Any], ...]:
-        """What it reads."""
-
-    @property
-    def outputs(self) -> tuple[Topic[Any], ...]:
-        """What it may send."""
-
-    def start(self) -> None:
-        """Load, compile, warm up; the process is not ready before this returns."""
-
-    def handle(self, topic: Topic[Any], message: Message) -> Iterable[Output]:
-        """Answer a message; an exception is counted as failed and the process goes on."""
-
-    def tick(self, now_ns: int) -> Iterable[Output]:
-        """Called at least every 20 ms while no message is being handled, for deadlines and sources."""
-
-    def stop(self) -> None:
-        """Let go of what `start` took; called also when `start` was interrupted."""
-
-
-@runtime_checkable
-class KeepsTime(Protocol):
-    """A handler whose next tick is not to wait for the usual 20 ms."""
-
-    def tick_in_s(self, now_ns: int) -> float:
-        """How long until `tick` is to be called, at most."""
-
-
-@runtime_checkable
-class HearsObjects(Protocol):
-    """A handler that hears several objects of its camera, and is told whose a message is."""
-
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Their names; none where it hears its own alone."""
-
-    def handle_of(self, object: str, topic: Topic[Any], message: Message) -> Iterable[Output]:
-        """As `handle`, of a message of one of them."""
-
-
-class JoinedHandler:
-    """A handler that gets its inputs joined by frame and pass, and never answers with silence.
-
-    `inputs[0]` drives: each of its messages is answered once, on `output` or with a Failure. A subclass sets `name`,
-    `inputs` and `output`, and `optional` for inputs that it can do without, and implements `answer`. One that defines
-    `__init__` calls this one's.
-    """
-
-    name: str
-    inputs: tuple[Topic[Any], ...]
-    output: Topic[Any]
-    optional: tuple[Topic[Any], ...] = ()
-    join_timeout_s: float = 1.0
-
-    def __init__(self) -> None:
-        self.failed = 0
-        self._joiner = Joiner(self.inputs, self.join_timeout_s)
-        self._throttle = Throttle(stage_logger(self.name))
-
-    @property
-    def outputs(self) -> tuple[Topic[Any], ...]:
-        """What it sends."""
-        return (self.output, FAILURE)
-
-    def start(self) -> None:
-        """Nothing to load unless a subclass says so."""
-
-    def stop(self) -> None:
-        """Nothing to let go unless a subclass says so."""
-
-    def answer(self, joined: Joined) -> Message | Reason:
-        """The message for the joined inputs, or why there is none. An exception becomes INTERNAL_ERROR."""
-        raise NotImplementedError
-
-    def handle(self, topic: Topic[Any], message: Message) -> Iterator[Output]:
-        for joined in self._joiner.add(topic, message, time.time_ns()):
-            yield self._reply(joined)
-
-    def tick(self, now_ns: int) -> Iterator[Output]:
-        for joined in self._joiner.expire(now_ns):
-            yield self._reply(joined)
-
-    def _reply(self, joined: Joined) -> Output:
-        answer = self._answered(joined)
-        if isinstance(answer, Reason):
-            return FAILURE, Failure(header=joined.header, stage=self.name, reason=answer)
-        return self.output, answer
-
-    def _answered(self, joined: Joined) -> Message | Reason:
-        needed = [topic for topic in joined.missing if topic not in self.optional]
-        if needed:
-            self._throttle.warning("input missing", inputs=", ".join(topic.name for topic in needed))
-            return Reason.FRAME_MISSING if FRAME in needed else Reason.INPUT_MISSING
-        try:
-            answer: object = self.answer(joined)
-            if not isinstance(answer, Message | Reason):
-                raise TypeError(f"answered with a {type(answer).__name__}")
-            return answer
-        except Exception as error:
-            self.failed += 1
-            self._throttle.warning("failed", error=describe(error))
-            return Reason.INTERNAL_ERROR
-
-
-def describe(error: BaseException) -> str:
-    """An exception in one line, with the place that raised it."""
-    frames = traceback.extract_tb(error.__traceback__)
-    place = f" ({frames[-1].filename.rsplit('/', 1)[-1]}:{frames[-1].lineno})" if frames else ""
-    return f"{type(error).__name__}: {' '.join(str(error).split())[:300]}{place}"
 
 
 def run_node(
@@ -242,6 +119,8 @@ class _Node:
         self._objects = handler.objects if isinstance(handler, HearsObjects) else ()
         self._outbox = Outbox(bus, address, handler.name)
         self._inbox: Inbox | None = None
+        self._desk = Desk()
+        self._served: Closing | None = None
         self._token: Closing | None = None
         self._closed = False
         self._throttle = Throttle(stage_logger(handler.name))
@@ -276,6 +155,8 @@ class _Node:
         heard = replace(self._address, object="*") if self._objects else self._address
         inputs = self._handler.inputs
         self._inbox = Inbox(self._bus, heard, inputs, capacities, self._refused, self._arrived)
+        if isinstance(self._handler, Controlled):
+            self._served = self._bus.serve(self._address.control(self._handler.name), self._answer)
 
     def be_ready(self) -> None:
         self._token = self._bus.hold(self._address.live(self._handler.name))
@@ -288,6 +169,7 @@ class _Node:
         received = self._inbox.get(0.0) if self._inbox is not None else None
         if received is not None:
             self._run(lambda: self._handled(received))
+        self._desk.work(self._carry_out)
         if time.monotonic() >= self._next_tick:
             self._run(lambda: self._handler.tick(time.time_ns()))
             self._next_tick = time.monotonic() + self._tick_in_s()
@@ -299,11 +181,32 @@ class _Node:
         if self._closed:
             return
         self._closed = True
-        for listening in (self._token, self._inbox):
+        self._desk.close()
+        for listening in (self._token, self._served, self._inbox):
             if listening is not None:
                 listening.close()
         self._handler.stop()
         self._send_stats(ready=False)
+
+    def _answer(self, payload: bytes) -> bytes:
+        """Called from threads of the bus."""
+        try:
+            return self._desk.answer(payload)
+        except FieldposeError as error:
+            self._throttle.warning("refused", request=str(error))
+            raise
+
+    def _carry_out(self, request: Request) -> ControlValues:
+        assert isinstance(self._handler, Controlled)
+        try:
+            values, outputs = self._handler.control(request, time.time_ns())
+        except FieldposeError:
+            raise
+        except Exception as error:
+            self._note_failure(error)
+            raise
+        self._run(lambda: outputs)
+        return values
 
     def _handled(self, received: Received) -> Iterable[Output]:
         if not isinstance(self._handler, HearsObjects) or not self._objects:
@@ -330,8 +233,7 @@ class _Node:
         except EndOfInput:
             raise
         except Exception as error:
-            self._failed += 1
-            self._throttle.warning("failed", error=describe(error))
+            self._note_failure(error)
         if self._outbox.published > before:
             self._busy_ms.append((time.perf_counter() - started) * 1e3)
             self._busy_s += self._busy_ms[-1] / 1e3
@@ -341,12 +243,15 @@ class _Node:
         try:
             self._outbox.publish(topic, message)
         except CodecError as error:
-            self._failed += 1
-            self._throttle.warning("failed", error=describe(error))
+            self._note_failure(error)
             if FAILURE in self._handler.outputs and topic is not FAILURE:
                 header = reply_header(message.header)
                 failure = Failure(header=header, stage=self._handler.name, reason=Reason.INTERNAL_ERROR)
                 self._outbox.publish(FAILURE, failure)
+
+    def _note_failure(self, error: Exception) -> None:
+        self._failed += 1
+        self._throttle.warning("failed", error=describe(error))
 
     def _refused(self, topic: Topic[Any], error: CodecError) -> None:
         self._throttle.warning("refused", topic=topic.name, error=str(error))
@@ -365,7 +270,7 @@ class _Node:
             ready=ready,
             received=counts.received,
             published=self._outbox.published,
-            refused=counts.refused,
+            refused=counts.refused + self._desk.refused,
             gaps=counts.gaps,
             skipped=counts.skipped,
             failed=self._failed + (self._handler.failed if isinstance(self._handler, JoinedHandler) else 0),

@@ -5,11 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from fieldpose.bus.topics import Address, Topic
-from fieldpose.errors import TransportError
+from fieldpose.errors import FieldposeError, TransportError
 
 SETTLE_S = 2.0
 
@@ -18,6 +18,19 @@ Sink = Callable[[str, bytes, int], None]
 
 Watcher = Callable[[str, bool], None]
 """Takes (key, alive) of a liveliness token that appeared or disappeared."""
+
+
+Answer = Callable[[bytes], bytes]
+"""Takes the payload of a request and gives that of the answer, or raises what the refusal is to say; is called from
+threads of the bus, several at once, and may take its time."""
+
+
+@dataclass(frozen=True)
+class Replies:
+    """What was said to a request: the answers' payloads by the key that answered, and the refusals, a line each."""
+
+    answers: dict[str, bytes]
+    refusals: tuple[str, ...] = ()
 
 
 class Closing(Protocol):
@@ -34,6 +47,15 @@ class Bus(Protocol):
 
     def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:
         """Give what arrives to `sink`; while that is held up, `capacity` messages wait (1: the newest)."""
+
+    def serve(self, key: str, answer: Answer) -> Closing:
+        """Answer what is asked under a concrete key; once closed, nothing is being answered any more."""
+
+    def ask(self, key: str, payload: bytes, timeout_s: float) -> Replies:
+        """Ask all who serve the key, and wait for what they say.
+
+        Raises TransportError where nobody has said anything within the time.
+        """
 
     def hold(self, key: str) -> Closing:
         """Hold a liveliness token until closed, or until this process dies."""
@@ -63,6 +85,17 @@ class Closer:
         action, self._action = self._action, None
         if action is not None:
             action()
+
+
+def refusal(key: str, error: Exception) -> str:
+    """What who has asked is told, in one line."""
+    text = str(error) if isinstance(error, FieldposeError) else f"failed: {type(error).__name__}: {error}"
+    return f"{key}: {' '.join(text.split())}"
+
+
+def nobody_answers(key: str, timeout_s: float) -> TransportError:
+    """What is raised where a request is answered by nobody."""
+    return TransportError(f"nobody answers at {key} after {timeout_s:g} s; is that pipeline running, and ready?")
 
 
 def wait_for(bus: Bus, address: Address, stages: Iterable[str], timeout_s: float) -> None:

@@ -47,6 +47,11 @@ class Address:
         _check_part("stage", stage)
         return f"{self.site}/live/{self.object}/{self.camera}/{stage}"
 
+    def control(self, stage: str) -> str:
+        """The key under which `stage` answers requests while it is ready, where it takes any."""
+        _check_part("stage", stage)
+        return f"{self.site}/control/{self.object}/{self.camera}/{stage}"
+
 
 def shared_address(addresses: Sequence[Address]) -> Address:
     """One that listens to all of these, which are at one site: "*" in the parts in which they differ."""
@@ -120,11 +125,12 @@ POSE = Topic("pose", _PIPELINE + "pose", messages.Pose, max_bytes=_SMALL)
 FAILURE = Topic("failure", _PIPELINE + "failure", messages.Failure, max_bytes=_SMALL)
 FOLLOWED = Topic("followed", _PIPELINE + "followed", messages.Followed, max_bytes=_SMALL)
 STATE = Topic("state", _PIPELINE + "state", messages.State, max_bytes=_SMALL)
+CONTROL = Topic("control", _PIPELINE + "control", messages.Control, max_bytes=_SMALL)
 STATS = Topic("stats", "{site}/stats/{object}/{camera}/{stage}", messages.Stats, capacity=256, max_bytes=16 << 10)
 
 ALL: tuple[Topic[Any], ...] = (
     FRAME, CAMERA_INFO, TRUTH, PRIOR, SEARCH, RETRIEVED, GUESS, VIEW, MATCHES, CORRESPONDENCES, ESTIMATE, POSE, FAILURE,
-    FOLLOWED, STATE, STATS,
+    FOLLOWED, STATE, CONTROL, STATS,
 )  # fmt: skip
 BY_NAME: dict[str, Topic[Any]] = {topic.name: topic for topic in ALL}
 

@@ -1,4 +1,4 @@
-"""The bus between processes and hosts, over Zenoh; the only place that knows Zenoh."""
+"""The bus between processes and hosts, over Zenoh, which only this module and `questions` know."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ import zenoh
 
 from fieldpose.bus.memory import MemoryBus
 from fieldpose.bus.presence import Presence
-from fieldpose.bus.protocol import Bus, Closer, Closing, Sink, Watcher, wait_for
+from fieldpose.bus.protocol import Answer, Bus, Closer, Closing, Replies, Sink, Watcher, nobody_answers, wait_for
+from fieldpose.bus.questions import asked, feed_questions
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Topic
 from fieldpose.errors import TransportError
@@ -30,6 +31,8 @@ LOCAL_HUB = "tcp/127.0.0.1:7447"
 _LOCAL_PEER = "tcp/127.0.0.1:0"
 _POOL_BYTES = 32 << 20
 """A sender comes to use all of it before it uses any again; room for five full-HD images as pixels."""
+_QUESTIONS = 64
+_ASK_AGAIN_S, _LEAST_S = 0.05, 0.01
 _ENDPOINT = re.compile(r"[a-z]+/.+:\d{1,5}([?#].*)?")
 _PRIORITIES = {"data": zenoh.Priority.DATA, "data_low": zenoh.Priority.DATA_LOW}
 # A message waits this long for a receiver that is busy for a moment; while one takes nothing at all, what is meant
@@ -101,6 +104,33 @@ class ZenohBus:
             thread.join()
 
         return self._closer(end)
+
+    def serve(self, key: str, answer: Answer) -> Closing:
+        # A ring: where Python is kept from running, a full channel must not hold up what else comes over the link.
+        queryable = self._session.declare_queryable(key, zenoh.handlers.RingChannel(_QUESTIONS))
+        thread = threading.Thread(
+            target=feed_questions, args=(queryable.handler, key, answer), name=f"answer {key}", daemon=True
+        )
+        thread.start()
+
+        def end() -> None:
+            queryable.undeclare()
+            thread.join()
+
+        return self._closer(end)
+
+    def ask(self, key: str, payload: bytes, timeout_s: float) -> Replies:
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                replies = asked(self._session, key, payload, max(deadline - time.monotonic(), _LEAST_S))
+            except zenoh.ZError as error:
+                raise TransportError(f"cannot ask {key}: {_reason(error)}") from error
+            if replies is not None:
+                return replies
+            if time.monotonic() > deadline:
+                raise nobody_answers(key, timeout_s)
+            time.sleep(_ASK_AGAIN_S)  # nobody is there, or nobody yet
 
     def hold(self, key: str) -> Closing:
         return self._presence.hold(key)

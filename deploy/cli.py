@@ -24,6 +24,7 @@ COMMANDS = {
     "run": "the pipeline: a source of images through every stage, each a process",
     "stage": "one process of the pipeline, for another host or a debugger",
     "record": "record a pipeline that is running",
+    "control": "reset the tracking of a pipeline that is running, give it a guess, or ask how it is",
     "replay": "run the pipeline again on a recording's frames and compare the poses",
     "info": "what a recording holds, topic by topic, and what it lacks",
     "edit": "a recorded sequence with a disturbance in it, to test how far tracking can be trusted",

@@ -21,6 +21,7 @@ from fieldpose.bus.protocol import Bus
 from fieldpose.bus.topics import (
     ALL,
     CAMERA_INFO,
+    CONTROL,
     CORRESPONDENCES,
     ESTIMATE,
     FAILURE,
@@ -179,7 +180,7 @@ GRAPH: tuple[Process, ...] = (
     ),
     Process(
         "tracking", _tracking, reads=(FRAME, CAMERA_INFO, PRIOR, VIEW, RETRIEVED, POSE, FAILURE),
-        writes=(SEARCH, GUESS, FOLLOWED, STATE), needs_field=True, serves="pipeline",
+        writes=(SEARCH, GUESS, FOLLOWED, STATE, CONTROL), needs_field=True, serves="pipeline",
     ),
     Process(
         "retrieval", _retrieval, reads=(SEARCH, FRAME), writes=(RETRIEVED, FAILURE), needs_field=True, solves=True,
@@ -203,7 +204,8 @@ GRAPH: tuple[Process, ...] = (
 BY_NAME: dict[str, Process] = {row.name: row for row in GRAPH}
 STAGES: tuple[str, ...] = tuple(row.name for row in GRAPH if row.writes)
 """The processes that take part in the dataflow."""
-BETWEEN_STAGES: Topics = tuple(topic for topic in ALL if topic not in (FRAME, CAMERA_INFO, TRUTH, PRIOR, STATE, STATS))
+_AROUND_STAGES = (FRAME, CAMERA_INFO, TRUTH, PRIOR, STATE, CONTROL, STATS)
+BETWEEN_STAGES: Topics = tuple(topic for topic in ALL if topic not in _AROUND_STAGES)
 """The topics of a frame on its way from the door to its pose."""
 
 AT_WORK: tuple[str, ...] = tuple(row.name for row in GRAPH if any(topic in BETWEEN_STAGES for topic in row.writes))

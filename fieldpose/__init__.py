@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from os import PathLike
 
     from fieldpose.bus.messages import CameraOrigin, Reason, State, TrackingState
+    from fieldpose.bus.requests import ControlValues
     from fieldpose.connection import Connection, connect
     from fieldpose.deploy.local import PoseFound
     from fieldpose.deploy.settings import Settings, read_settings
@@ -37,6 +38,7 @@ _WHERE = {
     "Camera": "stages.geometry",
     "CameraOrigin": "bus.messages",
     "Connection": "connection",
+    "ControlValues": "bus.requests",
     "Field": "stages.nerf.field",
     "FieldposeError": "errors",
     "PoseFinder": "finder",
@@ -54,9 +56,9 @@ _WHERE = {
 }
 
 __all__ = [
-    "Camera", "CameraOrigin", "Connection", "Field", "FieldposeError", "PoseFinder", "PoseFound", "RayRenderer",
-    "Reason", "RenderedView", "Settings", "State", "TrackingState", "connect", "load_field", "make_renderer",
-    "read_settings", "train",
+    "Camera", "CameraOrigin", "Connection", "ControlValues", "Field", "FieldposeError", "PoseFinder", "PoseFound",
+    "RayRenderer", "Reason", "RenderedView", "Settings", "State", "TrackingState", "connect", "load_field",
+    "make_renderer", "read_settings", "train",
 ]  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""Taking part in a running pipeline: listening to its states, sending it frames and guesses."""
+"""Taking part in a running pipeline: listening to its states, sending it frames and guesses, resetting it."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from types import TracebackType
 
 import numpy as np
 
+from fieldpose.bus.control import ask_one
 from fieldpose.bus.messages import CameraOrigin, Encoding, Prior, State
 from fieldpose.bus.ports import Inbox, Outbox, first_header
+from fieldpose.bus.requests import ControlValues, Request, Reset, SetGuess, SetSolving, Show
 from fieldpose.bus.topics import PRIOR, STATE, Address
 from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
 from fieldpose.deploy.processes.endpoints import peer_address
-from fieldpose.errors import GeometryError
+from fieldpose.errors import ConfigError, GeometryError
 from fieldpose.stages.camera.wire import frame_messages
-from fieldpose.stages.geometry import Camera, is_rigid
+from fieldpose.stages.geometry import RIGID_TOLERANCE, Camera, is_rigid
 from fieldpose.stages.images import checked_image
-from fieldpose.stages.tracking.wire import RIGID_TOLERANCE
 
 _POLL_S = 0.1
 _KEPT_STATES = 1024
@@ -27,7 +28,7 @@ class Connection:
     """One pipeline, an (object, camera) pair at a site, on the bus of a hub. Raises FieldposeError without a hub."""
 
     def __init__(self, hub: str, address: Address, timeout_s: float) -> None:
-        self._bus = ZenohBus(hub, peer_address(hub))
+        self._bus, self._address = ZenohBus(hub, peer_address(hub)), address
         try:
             self._bus.wait_for_hub(timeout_s)
             self._states = Inbox(self._bus, address, (STATE,), {STATE: _KEPT_STATES})
@@ -73,6 +74,36 @@ class Connection:
         if not is_rigid(pose, RIGID_TOLERANCE):
             raise GeometryError(f"a prior must be a rigid (4, 4) cam_from_object, got {pose.tolist()}")
         self._outbox.publish(PRIOR, Prior(header=first_header(frame_id, time.time_ns()), cam_from_object=pose))
+
+    def values(self, timeout_s: float = 5.0) -> ControlValues:
+        """How tracking is. Raises FieldposeError where it does not answer in time."""
+        return self._ask(Show(), timeout_s)
+
+    def reset(self, cam_from_object: np.ndarray | None = None, timeout_s: float = 5.0) -> ControlValues:
+        """Have tracking forget what it believes; the next frame begins at this guess (4, 4), or as the first did.
+
+        Raises FieldposeError for what is no rigid transform, where frames stand each by itself, or without an answer.
+        """
+        if cam_from_object is None:
+            return self._ask(Reset(), timeout_s)
+        pose = np.array(cam_from_object, np.float64)
+        if not is_rigid(pose, RIGID_TOLERANCE):
+            raise GeometryError(f"a guess must be a rigid (4, 4) cam_from_object, got {pose.tolist()}")
+        return self._ask(SetGuess(cam_from_object=pose), timeout_s)
+
+    def set_solving(self, per_second: float, timeout_s: float = 5.0) -> ControlValues:
+        """Have a frame solved at least so often, 0 to 100 times a second; 0: only where following needs it.
+
+        Raises FieldposeError for other numbers, where frames are not followed, or without an answer.
+        """
+        try:
+            request = SetSolving(solves_per_s=float(per_second))
+        except ValueError as error:
+            raise ConfigError(str(error)) from None
+        return self._ask(request, timeout_s)
+
+    def _ask(self, request: Request, timeout_s: float) -> ControlValues:
+        return ask_one(self._bus, self._address, "tracking", request, timeout_s)
 
     def close(self) -> None:
         """Leave the bus."""

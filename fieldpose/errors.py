@@ -13,6 +13,10 @@ class TransportError(FieldposeError):
     """The bus cannot be reached, or a process that should be on it is not."""
 
 
+class RefusedError(FieldposeError):
+    """A request to a running pipeline that it does not carry out."""
+
+
 class RecordingError(FieldposeError):
     """A recording that cannot be read or written."""
 

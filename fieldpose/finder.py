@@ -16,12 +16,11 @@ from fieldpose.deploy.plan import resolve
 from fieldpose.deploy.settings import Settings
 from fieldpose.errors import GeometryError
 from fieldpose.stages.camera.calibration import Calibrator
-from fieldpose.stages.geometry import Camera, is_rigid
+from fieldpose.stages.geometry import RIGID_TOLERANCE, Camera, is_rigid
 from fieldpose.stages.images import checked_image
 from fieldpose.stages.nerf.datasets.images import load_photo
 from fieldpose.stages.nerf.field import load_field
 from fieldpose.stages.nerf.training_views import training_views
-from fieldpose.stages.tracking.wire import RIGID_TOLERANCE
 
 
 class PoseFinder:

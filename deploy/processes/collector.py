@@ -149,7 +149,7 @@ def _outcome(seen: _Seen) -> Outcome:
     """What has a state is finished, whether or not any stage has worked on it."""
     if seen.state is None:
         return "lost" if seen.sent else "dropped"
-    return "lost" if seen.state.reason is Reason.NO_ANSWER else "finished"
+    return "lost" if seen.state.reason in (Reason.NO_ANSWER, Reason.RESET) else "finished"
 
 
 def _stage_ms(seen: _Seen) -> dict[str, float]:

@@ -61,13 +61,17 @@ class Standing:
 
 @dataclass(frozen=True)
 class Progress:
-    """What a run is doing, for people to look at; `standings`: of each pipeline; `pids`: its processes by name."""
+    """What a run is doing, for people to look at.
+
+    standings: of each pipeline; pids: its processes by name; hub: where others can join it.
+    """
 
     phase: Literal["starting", "running", "finishing"]
     waiting_for: tuple[str, ...] = ()
     standings: tuple[Standing, ...] = ()
     restarts: int = 0
     pids: Mapping[str, int] = field(default_factory=dict)
+    hub: str = ""
 
 
 Report = Callable[[Progress], None]
@@ -160,7 +164,7 @@ class _Running:
                 break
             if time.monotonic() > deadline:
                 raise ProcessError(f"not ready after {_START_S:g} s: {', '.join(waiting)}")
-            self._report(Progress("starting", waiting))
+            self._report(Progress("starting", waiting, hub=self._hub))
             self._stop.wait(_POLL_S)
         watching.close()
         self._limit = _RESTARTS

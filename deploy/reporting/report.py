@@ -22,13 +22,15 @@ CAMERA_ORIGINS = {
 
 @contextmanager
 def live_line(title: str) -> Iterator[Callable[[Progress], None]]:
-    """Gives a function that shows a run's progress on stderr."""
+    """Gives a function that shows a run's progress on stderr, and once, above it, where other programs find the hub."""
     console = progress_console()
     phase = ""
     with console.status(title) as status:
 
         def report(progress: Progress) -> None:
             nonlocal phase
+            if progress.phase == "starting" != phase:
+                console.print(f"{title}: hub {progress.hub}", highlight=False, soft_wrap=True)
             if progress.phase != phase and not console.is_terminal:
                 console.print(f"{title}: {progress.phase}", highlight=False)
             phase = progress.phase

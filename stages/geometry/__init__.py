@@ -12,6 +12,7 @@ from fieldpose.stages.geometry.errors import mahalanobis_squared, rotation_error
 from fieldpose.stages.geometry.jacobians import image_jacobian, twist_gradient
 from fieldpose.stages.geometry.limits import Limit, pairwise
 from fieldpose.stages.geometry.rigid import (
+    RIGID_TOLERANCE,
     adjoint,
     camera_centre,
     camera_centres,
@@ -28,6 +29,7 @@ from fieldpose.stages.geometry.sampling import perturb
 from fieldpose.stages.geometry.uncertainty import twist_covariance
 
 __all__ = [
+    "RIGID_TOLERANCE",
     "Camera",
     "Limit",
     "adjoint",

@@ -79,17 +79,22 @@ def adjoint(transform: Transform) -> Matrix6:
     return result
 
 
+RIGID_TOLERANCE = 1e-3
+"""How far what comes from outside may be from a rigid transform, as rounded numbers are."""
+
+
 def is_rigid(transform: ArrayLike, tolerance: float = 1e-4) -> bool:
     """Whether this is a finite (4, 4) matrix of a right-handed rotation, a translation and the row 0 0 0 1."""
     matrix = np.asarray(transform, dtype=np.float64)
     if matrix.shape != (4, 4) or not np.all(np.isfinite(matrix)):
         return False
     rotation = matrix[:3, :3]
-    return bool(
-        np.allclose(matrix[3], (0, 0, 0, 1), rtol=0, atol=tolerance)
-        and np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=tolerance)
-        and np.linalg.det(rotation) > 0
-    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        return bool(
+            np.allclose(matrix[3], (0, 0, 0, 1), rtol=0, atol=tolerance)
+            and np.allclose(rotation @ rotation.T, np.eye(3), rtol=0, atol=tolerance)
+            and np.linalg.det(rotation) > 0
+        )
 
 
 def nearest_rigid(transform: Transform) -> Transform:

@@ -12,7 +12,7 @@ import numpy as np
 
 from fieldpose.errors import ConfigError
 from fieldpose.stages.following.config import FollowingConfig
-from fieldpose.stages.geometry import is_rigid, nearest_rigid
+from fieldpose.stages.geometry import RIGID_TOLERANCE, is_rigid, nearest_rigid
 from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.tracking.config import TrackingConfig
 from fieldpose.stages.tracking.followed import FollowedPolicy
@@ -22,7 +22,6 @@ from fieldpose.stages.tracking.priors import Priors
 from fieldpose.stages.tracking.video import VideoPolicy
 
 _PERTURB = re.compile(r"(\d+(?:\.\d+)?)-(\d+(?:\.\d+)?)deg,(\d+(?:\.\d+)?)")
-_RIGID_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -130,6 +129,6 @@ def _pose(path: Path, rows: Any) -> np.ndarray:
         matrix = np.array(rows, dtype=np.float64)
     except (TypeError, ValueError):
         matrix = np.zeros(0)
-    if not is_rigid(matrix, _RIGID_TOLERANCE):
+    if not is_rigid(matrix, RIGID_TOLERANCE):
         raise ConfigError(f"{path}: a guess must be a 4x4 cam_from_object by rows: a rotation, a shift, then 0 0 0 1")
     return nearest_rigid(matrix)

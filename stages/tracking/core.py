@@ -10,7 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fieldpose.bus.messages import Reason
+from fieldpose.bus.messages import Reason, TrackingState
+from fieldpose.errors import RefusedError
+from fieldpose.stages.geometry.arrays import Transform
 from fieldpose.stages.tracking.certainty import with_camera
 from fieldpose.stages.tracking.config import DEADLINE_FACTOR, TrackingConfig
 from fieldpose.stages.tracking.motion import NS_PER_MS
@@ -18,6 +20,7 @@ from fieldpose.stages.tracking.policy import (
     Alike,
     Attempt,
     Belief,
+    CarriesOn,
     FrameInfo,
     Look,
     Policy,
@@ -144,6 +147,36 @@ class Tracker:
         if step is not None:
             return [self._take_step(attempt, step, now_ns)]
         return self._finish(attempt, result, now_ns)
+
+    @property
+    def begins_at(self) -> Transform | None:
+        """Where tracking begins when nothing is known of the camera; None where it tries views, or by frame."""
+        return self._policy.begins_at if isinstance(self._policy, CarriesOn) else None
+
+    @property
+    def solves_per_s(self) -> float | None:
+        """Each frame that is admitted is solved."""
+        return None
+
+    def solve_at_least(self, per_second: float) -> None:
+        """Raises RefusedError: each frame that is admitted is solved."""
+        raise RefusedError("frames are not followed here, so that each is solved; there is no rate to be set")
+
+    def restart(self, start: Transform | None, now_ns: int) -> list[Output]:
+        """Forget what is believed and all frames that have not left; the next begins at `start`, or as the first did.
+
+        What comes for these frames later is late. Raises RefusedError where no frame tells anything of another.
+        """
+        if not isinstance(self._policy, CarriesOn):
+            raise RefusedError("each frame stands by itself here, so that there is nothing to forget or to begin from")
+        self._policy.restart(start)
+        left, self._in_flight = self._in_flight, {}
+        self._lost += len(left)
+        waited, self._waiting = self._waiting, None
+        self._dropped += int(waited is not None)
+        nothing = Belief(TrackingState.INITIALIZING, 0.0, reason=Reason.RESET)
+        reports: list[Output] = [self._report(a.frame, max(a.pass_index, 0), nothing) for a in left.values()]
+        return reports if waited is None else [*reports, self._report(waited[0], 0, nothing)]
 
     def on_tick(self, now_ns: int) -> list[Output]:
         """Give up what is past its deadline, and go on without an answer to a Look that is; call it often."""

@@ -53,7 +53,7 @@ class FollowedPolicy(VideoPolicy):
     """A VideoPolicy for the frames that are solved, and the pose of every frame besides.
 
     ahead_ms: how long it takes until a view that is asked for is there; level: how much less than it might following
-    does.
+    does; solve_ms: a frame is solved at least this often, whatever is followed. Views stay when it is restarted.
     """
 
     def __init__(
@@ -65,8 +65,12 @@ class FollowedPolicy(VideoPolicy):
         self.follower = Follower(following)
         self.ahead_ms = 0.0
         self.level = 0
+        self.solve_ms = following.solve_ms
         self._follows = following
         self._same = following.same.scaled(views.scale)
+
+    def _begin(self, start: np.ndarray | None) -> None:
+        super()._begin(start)
         self._kept: deque[Seen] = deque(maxlen=_KEPT_FRAMES)
         self._measured: FIFOCache[int, Measured] = FIFOCache(_KEPT_FRAMES)
         self._asked_ns: int | None = None
@@ -210,7 +214,7 @@ class FollowedPolicy(VideoPolicy):
         return self._without_pose(frame, reason)
 
     def _due(self, capture_ns: int) -> bool:
-        return self._asked_ns is None or abs(capture_ns - self._asked_ns) > self._follows.solve_ms * NS_PER_MS
+        return self._asked_ns is None or abs(capture_ns - self._asked_ns) > self.solve_ms * NS_PER_MS
 
     def _speaks_against(self, measured: Measured, capture_ns: int, pose: np.ndarray | None, result: PoseResult) -> bool:
         """Whether a solve's pose is to replace what was followed."""

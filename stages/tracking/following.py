@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 
+from fieldpose.bus.requests import MOST_SOLVES_PER_S
 from fieldpose.stages.alignment.images import FramePyramid
 from fieldpose.stages.following.config import POINTS_BY_LEVEL, FollowingConfig
 from fieldpose.stages.following.core import Followed
@@ -94,6 +96,28 @@ class FollowingTracker:
     def on_tick(self, now_ns: int) -> list[Output | FollowedReport]:
         """Give up solves that are past their deadline; call it often."""
         return self._ordered(self._solves.on_tick(now_ns), now_ns)
+
+    @property
+    def begins_at(self) -> Transform | None:
+        """Where tracking begins when nothing is known of the camera; None where training views are tried."""
+        return self._policy.begins_at
+
+    @property
+    def solves_per_s(self) -> float | None:
+        """How often a frame is solved at least, whatever is followed."""
+        return min(1000 / max(self._policy.solve_ms, 1e-3), MOST_SOLVES_PER_S)
+
+    def solve_at_least(self, per_second: float) -> None:
+        """Have a frame solved so often; 0: only where little is found or no view has seen what will be seen soon."""
+        self._policy.solve_ms = 1000 / per_second if per_second > 0 else inf
+
+    def restart(self, start: Transform | None, now_ns: int) -> list[Output | FollowedReport]:
+        """Forget what is believed and what is being solved; the next frame begins at `start`, or as the first did.
+
+        Views stay, for they are still true. The frames that are forgotten have had their answers.
+        """
+        self._asked_ns = {}
+        return self._ordered(self._solves.restart(start, now_ns), now_ns)
 
     def took(self, ms: float) -> None:
         """Following a frame has taken so long; do less, or more again, if that is not what it may take."""

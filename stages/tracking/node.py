@@ -1,4 +1,4 @@
-"""Tracking as a process: what cameras and stages say in, searches, guesses and states out."""
+"""Tracking as a process: what cameras and stages say in, searches, guesses and states out; and requests."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from fieldpose.bus.logs import Throttle, stage_logger
 from fieldpose.bus.messages import CameraInfo, Failure, Frame, Message, Pose, Prior, Retrieved, View
 from fieldpose.bus.node import Output
 from fieldpose.bus.ports import Sequences
+from fieldpose.bus.requests import ControlValues, Request
 from fieldpose.bus.topics import (
     CAMERA_INFO,
+    CONTROL,
     FAILURE,
     FOLLOWED,
     FRAME,
@@ -29,21 +31,22 @@ from fieldpose.bus.topics import (
 )  # fmt: skip
 from fieldpose.stages.following.core import warm_up
 from fieldpose.stages.following.wire import See
-from fieldpose.stages.geometry import is_rigid
+from fieldpose.stages.geometry import RIGID_TOLERANCE, is_rigid
 from fieldpose.stages.tracking import core
-from fieldpose.stages.tracking.following import FollowedReport, FollowingTracker
-from fieldpose.stages.tracking.wire import RIGID_TOLERANCE, alike, copied, failed, frame_info, outputs_of, pose_result
+from fieldpose.stages.tracking.control import Controls
+from fieldpose.stages.tracking.following import FollowingTracker
+from fieldpose.stages.tracking.wire import Said, alike, copied, failed, frame_info, outputs_of, pose_result
 
 
 class TrackingNode:
-    """A Handler around the tracker that `make_tracker` gives at start.
+    """A Handler, and Controlled, around the tracker that `make_tracker` gives at start.
 
     see: makes a frame ready to be followed; with it, frames and views are read with their pixels. clock: the time in
     nanoseconds since the epoch.
     """
 
     name = "tracking"
-    outputs: tuple[Topic[Any], ...] = (SEARCH, GUESS, FOLLOWED, STATE)
+    outputs: tuple[Topic[Any], ...] = (SEARCH, GUESS, FOLLOWED, STATE, CONTROL)
 
     def __init__(
         self, make_tracker: Callable[[], core.Tracker | FollowingTracker], see: See | None = None
@@ -57,19 +60,26 @@ class TrackingNode:
 
     def start(self) -> None:
         self._tracker = self._make_tracker()
+        self._controls = Controls(self._tracker)
         if self._see is not None:
             warm_up()
 
     def handle(self, topic: Topic[Any], message: Message) -> Iterable[Output]:
-        return outputs_of(self._take_in(message, self.clock()))
+        if topic in (FRAME, CAMERA_INFO):
+            self._controls.came(message.header.frame_id)
+        return outputs_of(self._controls.note(self._take_in(message, self.clock())))
 
     def tick(self, now_ns: int) -> Iterable[Output]:
-        return outputs_of(self._tracker.on_tick(now_ns))
+        return outputs_of(self._controls.note(self._tracker.on_tick(now_ns)))
+
+    def control(self, request: Request, now_ns: int) -> tuple[ControlValues, Iterable[Output]]:
+        """Carry out a request. Raises RefusedError."""
+        return self._controls.carry_out(request, now_ns)
 
     def stop(self) -> None:
         """Nothing is held."""
 
-    def _take_in(self, message: Message, now_ns: int) -> Sequence[core.Output | FollowedReport]:
+    def _take_in(self, message: Message, now_ns: int) -> Sequence[Said]:
         tracker, header = self._tracker, message.header
         match message:
             case Frame() if isinstance(tracker, FollowingTracker) and self._see is not None:
@@ -96,9 +106,7 @@ class TrackingNode:
             case _:
                 raise TypeError(f"tracking takes no {type(message).__name__}")
 
-    def _follow(
-        self, tracker: FollowingTracker, frame: Frame, see: See, now_ns: int
-    ) -> Sequence[core.Output | FollowedReport]:
+    def _follow(self, tracker: FollowingTracker, frame: Frame, see: See, now_ns: int) -> Sequence[Said]:
         began_ns = self.clock()
         missed = self._sequences.seen(FRAME.name, frame.header)
         outputs = tracker.on_frame(frame_info(frame), see(frame), now_ns, missed)

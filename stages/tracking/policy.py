@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from fieldpose.bus.messages import CameraOrigin, GuessReason, Reason, TrackingState
 from fieldpose.stages.geometry import Camera
@@ -132,3 +132,15 @@ class Policy(Protocol):
     def missed(self, frame: FrameInfo, reason: Reason) -> Belief:
         """What is believed about a frame that has no result: lost on its way, or without a guess."""
         ...
+
+
+@runtime_checkable
+class CarriesOn(Protocol):
+    """A Policy to which the frames before tell something, so that it can forget that and begin again."""
+
+    @property
+    def begins_at(self) -> Transform | None:
+        """Where it begins when nothing is known of the camera; None where training views are tried."""
+
+    def restart(self, start: Transform | None = None) -> None:
+        """Forget all that frames have told, and begin at `start`, or without one as it first did."""

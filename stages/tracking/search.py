@@ -80,8 +80,7 @@ class Relocaliser:
     def __init__(self, views: TrainingViews, limit: Limit, near: Sequence[np.ndarray] = ()) -> None:
         order = farthest_point_order(views.cam_from_object, limit)
         self._far = [views.cam_from_object[i] for i in order]
-        self.restart(near)
-        self._next_far = 0
+        self.begin(near)
         if self.lap == 0:
             raise ConfigError("tracking has no pose to begin with: give --guess FILE, or a field with training views")
 
@@ -94,6 +93,11 @@ class Relocaliser:
     def lap(self) -> int:
         """Guesses until all poses have been tried, without those of retrieval."""
         return len(self._far) + len(self._near)
+
+    def begin(self, near: Sequence[np.ndarray]) -> None:
+        """Begin as at the very start, with these poses beside the training views."""
+        self.restart(near)
+        self._next_far = 0
 
     def restart(self, near: Sequence[np.ndarray]) -> None:
         """Begin again with these poses, most likely first; the training views go on where they were."""

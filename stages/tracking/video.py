@@ -38,13 +38,30 @@ class VideoPolicy:
     ) -> None:  # fmt: skip
         scale = self._scale = views.scale
         self._certainty = Certainty(views.error_scale, scale)
-        self._config, self._priors, self._start, self._looks = config, priors, start, looks
+        self._config, self._priors, self._looks, self._home = config, priors, looks, start
         self._settled = config.settled.scaled(scale)
         self._far = config.far.scaled(scale)
+        self._relocaliser = Relocaliser(views, COVER.scaled(scale), _near(start))
+        self._begin(start)
+
+    @property
+    def begins_at(self) -> np.ndarray | None:
+        """Where it begins when nothing is known of the camera; None where training views are tried."""
+        return self._start
+
+    def restart(self, start: np.ndarray | None = None) -> None:
+        """Forget all that frames have told, and begin at `start`, or without one as this policy first did.
+
+        Priors that have come are for frames to come, and stay.
+        """
+        self._begin(self._home if start is None else start)
+
+    def _begin(self, start: np.ndarray | None) -> None:
+        config, scale = self._config, self._scale
+        self._start = start
         self._motion = MotionModel(config.motion, scale)
         self._keyframes = Keyframes(KEYFRAME.scaled(scale), KEYFRAMES)
-        near = () if start is None else (start,)
-        self._relocaliser = Relocaliser(views, COVER.scaled(scale), near)
+        self._relocaliser.begin(_near(start))
         patience = self._relocaliser.lap if start is None else config.lost_after
         self._trust = Trust(config.lost_after, config.weak_after, patience)
         self._guesses = 0
@@ -182,3 +199,7 @@ class VideoPolicy:
         carried_on = self._trust.tracked and self._motion.within_horizon(frame.capture_ns)
         pose = self._motion.predict(frame.capture_ns) if carried_on else None
         return Belief(self._trust.state, 0.0, pose, reason=reason)
+
+
+def _near(start: np.ndarray | None) -> Sequence[np.ndarray]:
+    return () if start is None else (start,)

@@ -22,12 +22,13 @@ from fieldpose.bus.messages import (
 from fieldpose.bus.node import Output, first_header
 from fieldpose.bus.topics import FOLLOWED, GUESS, SEARCH, STATE
 from fieldpose.stages.following.wire import in_frame
-from fieldpose.stages.geometry import is_rigid
+from fieldpose.stages.geometry import RIGID_TOLERANCE, is_rigid
 from fieldpose.stages.tracking import core
 from fieldpose.stages.tracking.following import FollowedReport
 from fieldpose.stages.tracking.policy import Alike, FrameInfo, PoseResult
 
-RIGID_TOLERANCE = 1e-3
+Said = core.Output | FollowedReport
+"""What the Tracker wants said."""
 
 
 def frame_info(message: CameraInfo | Frame) -> FrameInfo:
@@ -64,7 +65,7 @@ def copied(array: np.ndarray) -> np.ndarray:
     return np.array(array, dtype=np.float64)
 
 
-def outputs_of(outputs: Iterable[core.Output | FollowedReport]) -> Iterator[Output]:
+def outputs_of(outputs: Iterable[Said]) -> Iterator[Output]:
     """The messages that say what the Tracker wants said."""
     for output in outputs:
         header = first_header(output.frame.frame_id, output.frame.capture_ns, output.pass_index)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from fieldpose.bus.topics import ALL, FOLLOWED, PRIOR, STATS
+from fieldpose.bus.topics import ALL, CONTROL, FOLLOWED, PRIOR, STATS
 from fieldpose.deploy.graph import AT_WORK, BY_NAME, GRAPH, HUB, RECORDER, STAGES, Launch, rows_of
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import resolve
@@ -45,7 +45,7 @@ def test_every_topic_has_who_writes_and_who_reads_it() -> None:
     written = {topic for row in GRAPH for topic in row.writes}
     read = {topic for row in GRAPH if row.name != RECORDER for topic in row.reads}
     assert written == set(ALL) - {STATS}
-    assert read == written - {FOLLOWED}, "which is for people and recordings"
+    assert read == written - {FOLLOWED, CONTROL}, "which are for people and recordings"
     assert set(BY_NAME[RECORDER].reads) == set(ALL)
     assert [row.name for row in GRAPH if PRIOR in row.writes] == ["perturbation"]
 

@@ -159,7 +159,8 @@ def test_a_stage_killed_in_the_demo_comes_back_and_the_recording_is_whole(
     assert summary["messages"]["lost"] <= 2  # what was under way at the kill may have reached only some
     by_topic = {topic.topic: topic.messages for topic in held.topics if topic.topic != "stats"}
     assert by_topic["frame"] == by_topic["truth"] == by_topic["state"] == FRAMES
-    assert {topic.name for topic in ALL} - by_topic.keys() <= {"stats", "search", "retrieved", "failure", "followed"}
+    unsaid = {"stats", "search", "retrieved", "failure", "followed", "control"}
+    assert {topic.name for topic in ALL} - by_topic.keys() <= unsaid
     assert set(held.attachments) == {"settings.json", "field.safetensors"}
     said = capsys.readouterr().out
     assert "rendering 1x" in said

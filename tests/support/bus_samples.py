@@ -10,6 +10,7 @@ from fieldpose.bus import topics
 from fieldpose.bus.messages import (
     CameraInfo,
     CameraOrigin,
+    Control,
     Correspondences,
     Estimate,
     Failure,
@@ -152,6 +153,9 @@ def every_message() -> dict[Topic[Any], Message]:
             finished=8,
             dropped_at_the_door=4,
             lost=0,
+        ),
+        topics.CONTROL: Control(
+            header=header, request="set_guess", after_frame=2, cam_from_object=np.eye(4), solves_per_s=None
         ),
         topics.STATS: Stats(
             header=header,

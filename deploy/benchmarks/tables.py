@@ -157,6 +157,21 @@ def _track_columns(measured: dict[str, Any]) -> dict[str, dict[str, Any]]:
     }
 
 
+def print_start(figures: dict[str, Any]) -> None:
+    """Print what `start.measure` has found."""
+    table = Table("", title=f"{figures['views']} starts, {figures['machine']}", title_justify="left", show_header=False)
+    table.add_column("", justify="right")
+    table.add_row("first answer right", _percent(figures["share_right"]))
+    table.add_row("right, and within a second", _percent(figures["share_in_time"]))
+    table.add_row("answered at all", _percent(figures["share_answered"]))
+    table.add_row("first pose, s: p50, p90, highest", _row(figures["first_pose_s"], ("p50", "p90", "max"), 2))
+    table.add_row("ready, s", _number(figures["ready_s"], 1))
+    for view in figures["not_right"]:
+        errors = [_number(view[name], 3) for name in ("rotation_error_deg", "translation_error")]
+        table.add_row(f"not right: {view['name']}", f"{' deg  '.join(errors)}")
+    result_console().print(table)
+
+
 def _track_table(title: str, columns: dict[str, dict[str, Any]]) -> Table:
     table = Table("", title=title, title_justify="left")
     for name in columns:

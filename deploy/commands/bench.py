@@ -233,6 +233,46 @@ class Track:
 
 
 @dataclass(frozen=True)
+class Start:
+    """How a pipeline begins by itself: started anew at each of several views, without a guess, until its first answer.
+
+    Example: fieldpose bench start out/lego.safetensors --source dataset:../shared/data/lego:test
+
+    A photo is shown as a camera that stands still would see it, a video from one of its frames on. The JSON file has:
+    machine, field, source, views, share_right, share_answered, share_in_time, first_pose_s (p50, p90, max), ready_s,
+    not_right (of each such view what came first), which stand in deploy/benchmarks/start.py.
+    """
+
+    field: tyro.conf.Positional[Path]
+    """The field (.safetensors) of the object or scene."""
+    source: str
+    """dataset:DIR:test, or a recording with true poses, mcap:FILE."""
+    views: int = 25
+    """Spread over the source."""
+    seconds: float = 2.0
+    """How long each may take to answer."""
+    cores: int | None = None
+    """Hold the whole pipeline to so many (default: all)."""
+    json: Path | None = None
+
+    def run(self) -> int:
+        """Measure, print."""
+        check_writable(self.json)
+        from fieldpose.deploy.benchmarks import machine, start
+
+        if self.views < 1 or not self.seconds > 0 or not 1 <= (self.cores or 1) <= machine.cores():
+            raise UsageError(
+                f"bench start: views and seconds must be above 0, and cores from 1 to {machine.cores()}, got"
+                f" {self.views}, {self.seconds:g} and {self.cores}"
+            )
+        report = _into(progress_console().print, "bench start")
+        figures = start.measure(self.field, self.source, self.views, self.seconds, self.cores, report)
+        write_json(self.json, figures)
+        tables.print_start(figures)
+        return 0
+
+
+@dataclass(frozen=True)
 class Options:
     """Measure how fast the parts are on this machine; run it while nothing else runs.
 
@@ -245,6 +285,7 @@ class Options:
         | Annotated[Match, tyro.conf.subcommand("match")]
         | Annotated[Bus, tyro.conf.subcommand("bus")]
         | Annotated[Track, tyro.conf.subcommand("track")]
+        | Annotated[Start, tyro.conf.subcommand("start")]
     ]
 
     def run(self) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -13,24 +12,19 @@ import cv2
 import msgspec
 import numpy as np
 
-from fieldpose.bus.messages import Header
 from fieldpose.bus.recording import RecordingWriter, partial_path
 from fieldpose.bus.replay import Attachment, info, read_attachment
-from fieldpose.bus.topics import Address
 from fieldpose.deploy.evaluation.edits import edit_of, parameters_of
+from fieldpose.deploy.evaluation.film import FrameLog
 from fieldpose.deploy.evaluation.shots import NS_PER_S, Shot, shots_of
 from fieldpose.deploy.reporting.provenance import EDIT_RECORD
 from fieldpose.errors import OutputError, RecordingError, SourceError, UsageError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame
 from fieldpose.stages.camera.sources import open_source
-from fieldpose.stages.camera.wire import messages_of
 from fieldpose.stages.images import decoded, shrunk_with_camera
 
 EDIT_ATTACHMENT = "edit.json"
-_SOURCE = "camera"
-_LEAST_NS = 1000
-"""Between two frames: readers go by the time at which a frame was sent."""
 
 Report = Callable[[int, int], None]
 
@@ -131,7 +125,7 @@ def edit_recording(
     shots = edit(_part(source, recipe), np.random.default_rng(recipe.seed))
     record = EditRecord(name, parameters_of(edit), source.name, recipe, [])
     with _new_recording(out, record) as writer:
-        log = _FrameLog(writer)
+        log = FrameLog(writer)
         for shot in shots:
             frame, visible = _finished(shot, recipe)
             log.write(frame)
@@ -169,25 +163,6 @@ def _new_recording(out: Path, record: EditRecord) -> Iterator[RecordingWriter]:
         if isinstance(error, OSError):
             raise OutputError(f"{out}: cannot be written: {error.strerror}") from error
         raise
-
-
-class _FrameLog:
-    """Writes frames with all that a camera sends of them, each when it is due and after the one before."""
-
-    def __init__(self, writer: RecordingWriter) -> None:
-        self._writer, self._address = writer, Address()
-        self._sequence = Counter[str]()
-        self._sent_ns = 0
-
-    def write(self, frame: CapturedFrame) -> None:
-        capture_ns = frame.at_ns or 0
-        self._sent_ns = max(self._sent_ns + _LEAST_NS, capture_ns)
-        for topic, message in messages_of(frame, capture_ns):
-            number = self._sequence[topic.name]
-            header = Header(_SOURCE, number, frame.frame_id, 0, capture_ns, self._sent_ns)
-            sent = msgspec.structs.replace(message, header=header)
-            self._writer.write(self._address.key(topic), topic, sent, self._sent_ns)
-            self._sequence[topic.name] += 1
 
 
 def _finished(shot: Shot, recipe: Recipe) -> tuple[CapturedFrame, float]:

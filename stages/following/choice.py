@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,10 @@ from fieldpose.stages.geometry.arrays import Flags, Matrices2, Pixels64, Points6
 
 _CELLS = 8
 """Along the frame's longer side."""
+_EXACT = 0.1
+"""Radians between the directions of view at which what a field's depth is off counts as much as what a patch is: points
+of a view that saw them from further round count less. Of 0.03 to 0.2: with a poor field, a hand-held video's poses
+tremble a tenth to a quarter less, with good ones they are as they were."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,10 @@ class Chosen:
         results = []
         for view, index in self.parts:
             at = warped(view, frame, pose)
-            results.append((view, at, place(view, frame, at, level, index[at.seen[index]])))
+            placed = place(view, frame, at, level, index[at.seen[index]])
+            angles = viewing_angles(view.points[placed.index], view.cam_from_object, pose)
+            exact = 1 / (1 + (angles / _EXACT) ** 2)
+            results.append((view, at, replace(placed, weights=placed.weights * exact[:, None, None])))
         return _gathered(results, frame)
 
     def in_frame(self, frame: FramePyramid, pose: Transform) -> tuple[Pixels64, Points64]:

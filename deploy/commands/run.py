@@ -39,7 +39,9 @@ class Options:
     deploy/reporting/results.py.
     """
 
-    field: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="FIELD ...")] = ()
+    field: Annotated[
+        tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="FIELD ...", help_behavior_hint="")
+    ] = ()
     """The field (.safetensors) of the object or scene; of several objects FILE or NAME=FILE each."""
     source: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
     """folder:DIR, dataset:DIR:test, video:FILE, camera:0 or mcap:FILE; bus: other programs send the frames, see

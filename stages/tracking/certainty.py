@@ -26,6 +26,8 @@ _MOST_SCORE = 0.3
 _MOST_FOCAL, _FIELD_FOCAL, _KEPT = 0.025, 0.01, 0.95
 """On the demo scene and a hand-held video with two fields, one of them poor, single frames are off by up to 0.012 with
 the right camera; with one that is 0.05 off they say 0.038 to 0.049."""
+_RIGHT_FOCAL = 0.0125
+"""A focal length that has been seen to differ does so until it seems off by less: it is the same camera."""
 
 
 def with_camera(belief: Belief, frame: FrameInfo) -> Belief:
@@ -47,6 +49,7 @@ class FocalCheck:
 
     def __init__(self) -> None:
         self._sum = self._weight = 0.0
+        self._differs = False
 
     @property
     def error(self) -> float:
@@ -61,7 +64,8 @@ class FocalCheck:
     def applied(self, belief: Belief) -> Belief:
         """The belief, LIMITED and no surer than that where the focal length differs."""
         pose, off = belief.cam_from_object, abs(self.error)
-        if off < _MOST_FOCAL or pose is None:
+        self._differs = off >= (_RIGHT_FOCAL if self._differs else _MOST_FOCAL)
+        if not self._differs or pose is None:
             return belief
         state = TrackingState.LIMITED if belief.state is TrackingState.TRACKING else belief.state
         covariance = belief.covariance

@@ -23,7 +23,7 @@ from fieldpose.stages.alignment.placing import warped
 from fieldpose.stages.alignment.views import ViewPoints
 from fieldpose.stages.following.choice import Chosen, Found, chosen_points, is_found
 from fieldpose.stages.following.config import COARSE_POINTS, LEAST_FOUND, LEVELS, TOGETHER, FollowingConfig
-from fieldpose.stages.geometry import Camera, exp_se3, inverse, log_se3, twist_covariance, viewing_angles
+from fieldpose.stages.geometry import Camera, exp_se3, log_se3, twist_covariance, viewing_angles
 from fieldpose.stages.geometry.arrays import Covariance, Depth, Flags, Grey, Pixels32, Transform
 
 _LOOSER = 1.4
@@ -37,9 +37,6 @@ _BLURRED = 0.5
 """Where a finer level finds fewer than this share of what the coarser one has, the frame is blurred."""
 _FAR_PX = 2.0
 """A pose that puts points so much elsewhere than its start is compared with the one that is found without that."""
-_FAR = 0.005
-"""And one that is itself so far from it, in radians or shares of the distance: to turn and to step aside look alike, and
-a coarse level of a blurred frame leads from one to the other. Of 0.005 and 0.01 on a hand-held video with two fields."""
 _BY_TURN = 0.3
 """What turning the camera on the spot counts, to turning it around what it sees."""
 _TYPICAL = 32
@@ -161,19 +158,12 @@ def _refitted(found: Found, frame: FramePyramid, pose: Transform, level: int) ->
 
 def _better(chosen: Chosen, frame: FramePyramid, found: Followed | None, start: Transform) -> Followed | None:
     """What was found by way of the coarsest level, or without it, which may lead astray where the start was right."""
-    if found is not None and _as_expected(chosen, frame, found.cam_from_object, start):
+    if found is not None and chosen.shift(frame, start, found.cam_from_object) < _FAR_PX:
         return found
     direct = _followed(chosen, frame, start)
     if found is None or direct is None:
         return found or direct
     return direct if direct.found.sum() > found.found.sum() else found
-
-
-def _as_expected(chosen: Chosen, frame: FramePyramid, pose: Transform, start: Transform) -> bool:
-    off = log_se3(pose @ inverse(start))
-    off[:3] /= max(float(np.linalg.norm(pose[:3, 3])), 1e-12)
-    near = max(np.linalg.norm(off[:3]), np.linalg.norm(off[3:])) < _FAR
-    return bool(near) and chosen.shift(frame, start, pose) < _FAR_PX
 
 
 def _followed(chosen: Chosen, frame: FramePyramid, pose: Transform) -> Followed | None:

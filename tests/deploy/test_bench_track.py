@@ -20,7 +20,7 @@ from fieldpose.deploy.benchmarks import sequences, track
 from fieldpose.deploy.benchmarks.followed import Watcher, figures_of, jitter
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.commands.run import planned
-from fieldpose.deploy.graph import STAGES
+from fieldpose.deploy.graph import CAMERA, STAGES
 from fieldpose.deploy.processes.memory import pss_mb
 from fieldpose.deploy.processes.pipeline import Progress
 from fieldpose.deploy.reporting.results import FrameResult, RunResult, TruthKnown
@@ -149,7 +149,8 @@ def test_tracking_is_measured_in_processes_and_in_one(tmp_path: Path, capsys: py
     assert one["steps"]["1"]["share_right"] == one["share_right"]
     assert {"p50", "p90", "p99", "by_stage", "waiting"} == one["latency_ms"].keys()
     assert set(one["cpu_s_by_process"]) == {*STAGES} - {"perturbation"}
-    assert {*STAGES} - {"perturbation"} < one["pss_mb_by_process"].keys()
+    # When memory is at its highest the camera may have ended.
+    assert {*STAGES} - {"perturbation", CAMERA} < one["pss_mb_by_process"].keys()
     assert one["pss_mb"] == pytest.approx(sum(one["pss_mb_by_process"].values()))
     assert one["ready_s"] > 0
     assert written["ablations"] == {"default": written["sequences"]}

@@ -42,7 +42,7 @@ from fieldpose.bus.topics import (
 )  # fmt: skip
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan
-from fieldpose.errors import UsageError
+from fieldpose.errors import ConfigError, UsageError
 from fieldpose.stages.camera.sources import EXTERNAL, knows_truth
 
 HUB, RECORDER, CAMERA = "hub", "recorder", "camera"
@@ -113,7 +113,11 @@ def _recorder(parts: Parts, launch: Launch) -> Handler:
 def _camera(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.camera.node import CameraNode
 
-    config = parts.settings.camera
+    config, own = parts.settings.camera, parts.settings.address.object
+    if config.truth_of not in (None, own):
+        raise ConfigError(
+            f"camera: truth_of is {config.truth_of}, but this camera is of the object {own}; give --address.object"
+        )
     # A source that knows its frames' poses knows their cameras too.
     known = tuple if config.source and knows_truth(config.source) else parts.known_cameras
     return CameraNode(config, known, launch.wait_until_ready)

@@ -10,6 +10,7 @@ The figures of a run, which programs may rely on:
                      the message before to the stage's own; waiting: name -> what of that p50 the stage was not at work,
                      but its input under way or waiting for a place or a core
   rotation_error_deg, translation_error  {median, p99, max} of every measured pose against the truth
+  covariance         {50, 90, 99}: the share of measured poses whose region of so many percent holds the truth
   wrong_while_tracking  poses with an error beyond the sequence's limits whose state says TRACKING
   states             state -> number of frames
   first_pose_s       from the first frame sent to the first state with a measured pose
@@ -29,10 +30,11 @@ from typing import Any
 import numpy as np
 import psutil
 
+from fieldpose.deploy.evaluation.scores import coverage
 from fieldpose.deploy.processes.memory import pss_mb
 from fieldpose.deploy.processes.pipeline import Progress
 from fieldpose.deploy.reporting.results import CLOSE, CLOSE_DEG, FrameResult, RunResult, summarise
-from fieldpose.stages.geometry import Limit, inverse, log_se3
+from fieldpose.stages.geometry import Limit, inverse, log_se3, mahalanobis_squared
 
 RIGHT = Limit(CLOSE_DEG, CLOSE)
 """The limits of the paper's table I, by which a pose is right."""
@@ -98,6 +100,13 @@ def figures_of(run: RunResult, watched: Watcher, limit: Limit) -> dict[str, Any]
         "latency_ms": _latency_ms(run.frames, summary),
         "rotation_error_deg": _highest(errors[:, 0]),
         "translation_error": _highest(errors[:, 1]),
+        "covariance": coverage(
+            [
+                mahalanobis_squared(frame.cam_from_object, frame.covariance, frame.true_pose)
+                for frame in found
+                if frame.cam_from_object is not None and frame.covariance is not None and frame.true_pose is not None
+            ]
+        ),
         "wrong_while_tracking": sum(
             frame.state == "tracking" and not _within(frame, limit) for frame in found if frame.errors is not None
         ),

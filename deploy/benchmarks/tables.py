@@ -219,6 +219,7 @@ _TRACK_ROWS: dict[str, Callable[[dict[str, Any]], str]] = {
     "rotation error, degrees: median, 99 %, highest": lambda f: _row(f["rotation_error_deg"], _ERRORS, 3),
     "translation error: median, 99 %, highest": lambda f: _row(f["translation_error"], _ERRORS, 4),
     "jitter, degrees and units": lambda f: _row(f["jitter"], ("rotation_deg", "translation"), 4),
+    "truth within 50, 90, 99 % regions": lambda f: _row(f["covariance"], ("50", "90", "99"), 2),
     "wrong while TRACKING": lambda f: f"{f['wrong_while_tracking']}",
     "states": lambda f: ", ".join(f"{state} {count}" for state, count in f["states"].items()),
     "ready, s; then first pose, s": lambda f: f"{_number(f['ready_s'], 1)}  {_number(f['first_pose_s'], 2)}",

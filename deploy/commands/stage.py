@@ -35,6 +35,7 @@ from fieldpose.deploy.processes.preload import field_of, pipelines_of
 from fieldpose.deploy.processes.threads import hold_to
 from fieldpose.deploy.processes.warmup import compile_kernels
 from fieldpose.deploy.settings import Settings
+from fieldpose.errors import UsageError
 
 if TYPE_CHECKING:
     from fieldpose.stages.nerf.field import Field
@@ -136,8 +137,10 @@ def _served(options: Options, row: Process) -> list[tuple[Plan, Field | None]]:
     """The plans that the process serves, each with its field if it needs that."""
     if options.pipelines is None:
         return [planned(options, row)]
-    those = [one for one in pipelines_of(options.pipelines) if row.name in one.processes]
-    return [planned(replace(options, settings=one.settings, field=one.field), row) for one in those]
+    those = [one.read() for one in pipelines_of(options.pipelines) if row.name in one.processes]
+    if not those:
+        raise UsageError(f"{options.pipelines}: lists no pipeline that has a process {row.name}")
+    return [planned(replace(options, settings=settings, field=field), row) for settings, field in those]
 
 
 def _parts(plan: Plan, field: Field | None, threads: int, row: Process) -> Parts:

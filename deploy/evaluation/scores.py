@@ -92,7 +92,7 @@ def score(answers: Sequence[Answer], surface: Surface | None = None) -> dict[str
         **_statistics("te", found[:, 1] if scale_known else found[:0, 1]),
         "seconds_per_image": float(np.mean([answer.seconds for answer in answers])),
         "stage_ms": _stage_means([answer.stage_ms for answer in answers if answer.errors is not None]),
-        "covariance": _coverage(distances),
+        "covariance": coverage(distances),
         "add": _surface_scores(answers, surface) if surface is not None and scale_known else None,
     }
 
@@ -124,7 +124,8 @@ def _stage_means(stage_ms: Sequence[Mapping[str, float]]) -> dict[str, float] | 
     return {stage: float(np.mean([ms.get(stage, 0.0) for ms in stage_ms])) for stage in stages} or None
 
 
-def _coverage(distances: Sequence[float]) -> dict[str, float] | None:
+def coverage(distances: Sequence[float]) -> dict[str, float] | None:
+    """By percentage, the share of poses whose region of so much holds the truth, by squared Mahalanobis distances."""
     if not distances:
         return None
     squared = np.array(distances)

@@ -3,40 +3,44 @@
 from __future__ import annotations
 
 import importlib
-import json
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from fieldpose.deploy.processes.forking import beside
 from fieldpose.deploy.processes.threads import hold_to
 from fieldpose.deploy.processes.warmup import compile_kernels
-from fieldpose.deploy.settings import Settings, read_settings
-from fieldpose.errors import FieldposeError
+from fieldpose.deploy.settings import Settings, read_file, read_settings
+from fieldpose.errors import ConfigError, FieldposeError
 
 if TYPE_CHECKING:
     from fieldpose.stages.nerf.field import Field
 
 
-@dataclass(frozen=True)
-class Pipeline:
-    """What the processes of a pipeline are started with."""
+class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What the processes of a pipeline are started with: a file of settings, a field's file, and their names."""
 
-    settings: Settings
-    field: Path | None
+    settings: str
+    field: str | None
     processes: tuple[str, ...]
+
+    def read(self) -> tuple[Settings, Path | None]:
+        """Its settings, and where its field is. Raises ConfigError."""
+        return read_settings(self.settings), None if self.field is None else Path(self.field)
 
 
 def pipelines_of(file: str | Path) -> list[Pipeline]:
     """The pipelines of a run, as `programs` has listed them. Raises ConfigError."""
-    listed = json.loads(Path(file).read_text(encoding="utf-8"))
-    return [
-        Pipeline(read_settings(one["settings"]), one["field"] and Path(one["field"]), tuple(one["processes"]))
-        for one in listed
-    ]
+    content = read_file(Path(file))
+    try:
+        return msgspec.convert(content.get("pipelines"), list[Pipeline])
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{file}: no list of pipelines as `fieldpose run` leaves it: {error}") from error
 
 
 def preload(file: str) -> None:
@@ -52,7 +56,7 @@ def preload(file: str) -> None:
     # Compiled by others the first time, which takes half a minute and memory that would stay; then only read.
     with beside(*kernels):
         for pipeline in pipelines:
-            _networks(pipeline.settings, pipeline.processes)
+            _networks(pipeline.read()[0], pipeline.processes)
     for work in kernels:
         work()
     hold_to(1)
@@ -61,7 +65,7 @@ def preload(file: str) -> None:
 def _of_each(work: Callable[[Settings, Path | None], None], name: str, pipelines: Sequence[Pipeline]) -> None:
     for pipeline in pipelines:
         if name in pipeline.processes:
-            work(pipeline.settings, pipeline.field)
+            work(*pipeline.read())
 
 
 @cache

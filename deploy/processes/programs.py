@@ -116,7 +116,7 @@ def _write_settings(plans: Sequence[Plan], folder: Path, everyone: Sequence[Memb
         field = None if plan.field is None else str(plan.field.resolve())
         names = [member.row.name for member in everyone if plan in member.plans]
         listed.append({"settings": str(config), "field": field, "processes": names})
-    (folder / PIPELINES).write_text(json.dumps(listed, indent=2) + "\n", encoding="utf-8")
+    (folder / PIPELINES).write_text(json.dumps({"pipelines": listed}, indent=2) + "\n", encoding="utf-8")
 
 
 def _settings_file(folder: Path, plan: Plan, plans: Sequence[Plan]) -> Path:

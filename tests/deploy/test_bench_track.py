@@ -59,9 +59,10 @@ def test_jitter_is_what_trembles_and_no_constant_error() -> None:
 
 def test_a_followed_run_counts_every_pose_and_every_frame() -> None:
     good, turned = np.zeros(6), np.array([0, 0, 0, np.deg2rad(2.0), 0, 0])
+    sure = 1e-6 * np.eye(6)
     frames = [
-        found_pose(0, good),
-        found_pose(1, turned),
+        found_pose(0, good, covariance=sure),
+        found_pose(1, turned, covariance=sure),
         found_pose(2, turned, state="limited"),
         found_pose(3, good, cam_from_object=None, carried=np.eye(4), score=0.0, state="lost"),
         FrameResult(4, 4 * FRAME_NS, "dropped", sent_ns=4 * FRAME_NS),
@@ -71,6 +72,7 @@ def test_a_followed_run_counts_every_pose_and_every_frame() -> None:
     assert (figures["carried"], figures["wrong_while_tracking"]) == (1, 1)
     assert figures["rotation_error_deg"]["max"] == pytest.approx(2.0)
     assert figures["rotation_error_deg"]["median"] == pytest.approx(2.0)
+    assert figures["covariance"] == {"50": 0.5, "90": 0.5, "99": 0.5}
     assert figures["latency_ms"]["p50"] == 50.0
     assert figures["states"] == {"tracking": 2, "limited": 1, "lost": 1}
     assert figures["first_pose_s"] == pytest.approx(0.049)

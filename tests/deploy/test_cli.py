@@ -75,6 +75,7 @@ def test_each_command_describes_itself_with_an_example(name: str, capsys: pytest
         (["run", "nothing.safetensors", "--source", "camera:0"], "nothing.safetensors: no such field file"),
         (["train", "nothing", "--out", "f.safetensors"], "nothing: no such folder"),
         (["stage", "pnp", "--connect", "nowhere"], "'nowhere' is no address of a hub"),
+        (["stage", "pnp", "--pipelines", "nothing.json"], "nothing.json: no such configuration file"),
         (["stage", "pnp", "--config", "nothing.toml"], "nothing.toml: no such configuration file"),
     ],
 )
@@ -138,6 +139,15 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
     options = parse(run.Options, "run", ["f", f"--config={path}", "--matching.matcher", "loftr"])
     assert options.settings.matching.matcher == "loftr"
     assert parse(stage.Options, "stage", ["pnp"]).settings.matching.matcher == "xfeat"
+
+
+def test_a_camera_sends_no_true_poses_of_another_object_than_its_own(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("fieldpose.deploy.commands.stage.log_to_stderr", lambda: None)
+    monkeypatch.setattr("fieldpose.deploy.commands.stage.hold_to", lambda threads: None)
+    assert main(["stage", "camera", "--camera.source", "bus", "--camera.truth-of", "can"]) == 2
+    assert "truth_of is can, but this camera is of the object object" in capsys.readouterr().err
 
 
 def test_short_flags_are_the_long_ones(tmp_path: Path) -> None:

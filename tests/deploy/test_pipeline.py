@@ -109,7 +109,7 @@ def test_of_several_pipelines_most_processes_serve_all_and_wait_for_those_of_the
     assert waits == {*listeners, *stages, *(f"lamp/right/{stage}" for stage in stages)}
     assert of(made, "tracking@can@right", "--wait-for") == [f"lamp/left/{name}" for name in (OBSERVER, RECORDER)]
     (file,) = {tuple(of(made, name, "--pipelines")) for name in shared - {HUB}}
-    listed = json.loads(Path(file[0]).read_text())
+    listed = json.loads(Path(file[0]).read_text())["pipelines"]
     assert [Path(one["field"]).stem for one in listed] == ["lamp", "can", "lamp", "can"]
     assert len({one["settings"] for one in listed}) == 4
     assert of(made, "tracking@can@right", "--config") == [listed[3]["settings"]]

@@ -53,7 +53,7 @@ def signatures():
     return {{(str(one), *map(str, one.signatures)) for one in gc.get_objects() if isinstance(one, Dispatcher)}}
 
 before = signatures()
-plan = planned(pipelines_of(sys.argv[1])[0].settings, Path({str(FIELD)!r}))
+plan = planned(pipelines_of(sys.argv[1])[0].read()[0], Path({str(FIELD)!r}))
 pipeline = LocalPipeline(Parts(plan, 1), with_camera=True)
 print(sum(said.topic.name == "state" for said in pipeline.play()), signatures() - before, len(before) > 4)
 """
@@ -65,7 +65,7 @@ def listed(folder: Path, *fields: Path) -> str:
     settings.write_bytes(to_json(planned(changed(Settings(), SEQUENCE, "test"), FIELD).settings))
     pipelines = [{"settings": str(settings), "field": str(field), "processes": list(BY_NAME)} for field in fields]
     path = folder / "pipelines.json"
-    path.write_text(json.dumps(pipelines))
+    path.write_text(json.dumps({"pipelines": pipelines}))
     return str(path)
 
 

@@ -18,12 +18,12 @@ from fieldpose.deploy.benchmarks import machine
 from fieldpose.deploy.benchmarks.fields import kept_field
 from fieldpose.deploy.benchmarks.memory import peak_mb
 from fieldpose.stages.geometry.cameras import rays
+from fieldpose.stages.nerf.blocks import View
 from fieldpose.stages.nerf.config import TrainingConfig
 from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.nerf.field import Field, load_field
 from fieldpose.stages.nerf.from_dataset import replace_metadata, train_field, views_of
 from fieldpose.stages.nerf.kernels.types import Net
-from fieldpose.stages.nerf.raybank import View
 from fieldpose.stages.nerf.renderer import NumbaRenderer
 from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedView
 from fieldpose.stages.nerf.torch_renderer import TorchRenderer

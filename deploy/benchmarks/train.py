@@ -17,11 +17,11 @@ from fieldpose.deploy.benchmarks import machine
 from fieldpose.deploy.benchmarks.depth import depth_error
 from fieldpose.deploy.benchmarks.fields import kept_field
 from fieldpose.deploy.benchmarks.memory import peak_mb
+from fieldpose.stages.nerf.blocks import View
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.nerf.from_dataset import held_out_views, metadata_of, replace_metadata, views_of
 from fieldpose.stages.nerf.metadata import FieldMetadata
-from fieldpose.stages.nerf.raybank import View
 from fieldpose.stages.nerf.renderer import NumbaRenderer
 from fieldpose.stages.nerf.torch_training import TorchTrainer
 from fieldpose.stages.nerf.training import Learner, Trainer, evaluate

@@ -13,20 +13,21 @@ import msgspec
 import numpy as np
 
 from fieldpose.stages.nerf.backend import resolved
+from fieldpose.stages.nerf.blocks import View
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.datasets import Dataset, load_dataset
 from fieldpose.stages.nerf.datasets.images import over_background
 from fieldpose.stages.nerf.field import Field
 from fieldpose.stages.nerf.metadata import FieldMetadata, PoseAccuracy, Space, TrainingCamera
 from fieldpose.stages.nerf.occupancy import finer
-from fieldpose.stages.nerf.raybank import View
 from fieldpose.stages.nerf.renderer import NumbaRenderer
 from fieldpose.stages.nerf.training import Learner, Progress, Trainer, evaluate
 
 if TYPE_CHECKING:
     from fieldpose.stages.nerf.datasets.assemble import Holdout
 
-BACKGROUNDS = {"white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0), None: (0.5, 0.5, 0.5)}
+GREY = (0.5, 0.5, 0.5)
+"""Behind a field of all that the images show, where a ray ends in nothing."""
 BOUNDED_STEP, CONTRACTED_STEP = 2 / 384, 1 / 128
 CONTRACTED_FAR = 64.0
 REPORT_EVERY_S = 0.25
@@ -68,7 +69,15 @@ def space_of(dataset: Dataset) -> Space:
 def views_of(dataset: Dataset) -> list[View]:
     """All images of a dataset, loaded."""
     images = dataset.load_images()
-    return [View(r.name, im, r.camera, r.cam_from_object) for r, im in zip(dataset.images, images, strict=True)]
+    behind = None if dataset.has_alpha else _background(dataset)
+    return [View(r.name, im, r.camera, r.cam_from_object, behind) for r, im in zip(dataset.images, images, strict=True)]
+
+
+def _background(dataset: Dataset) -> tuple[float, float, float] | None:
+    if dataset.background is None:
+        return None
+    red, green, blue = dataset.background
+    return red / 255, green / 255, blue / 255
 
 
 def _camera_record(view: View) -> TrainingCamera:
@@ -86,7 +95,7 @@ def metadata_of(dataset: Dataset, views: list[View], config: FieldConfig) -> Fie
     return FieldMetadata(
         space=space_of(dataset),
         config=config,
-        background=BACKGROUNDS[dataset.background],
+        background=_background(dataset) or GREY,
         cameras=[_camera_record(v) for v in views],
         dataset_kind=dataset.kind,
         dataset_sha256=dataset.content_hash(),

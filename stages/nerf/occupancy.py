@@ -12,6 +12,8 @@ from fieldpose.stages.nerf.kernels.density import raise_to
 from fieldpose.stages.nerf.kernels.types import BLOCK
 from fieldpose.stages.nerf.metadata import Space
 
+LEAST_OPACITY = 0.01
+
 
 def pack(occupied: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Bits (one a cell, x fastest) of an (n, n, n) bool grid [z, y, x], and distances in blocks of 4x4x4 cells.
@@ -45,6 +47,15 @@ def from_cube(space: Space, u: np.ndarray) -> np.ndarray:
             radius = np.where(norm <= 1, norm, np.where(norm < 2, 1 / (2 - norm), np.nan))
             y = np.where(norm > 0, z * (radius / norm), 0.0)
     return y * space.scale + np.array(space.centre)
+
+
+def cell_radii(space: Space, n: int, points: np.ndarray) -> np.ndarray:
+    """Of balls around cells with centres (k, 3), in object units: contraction makes far cells larger."""
+    half = np.sqrt(3) * space.scale / n
+    if not space.contracted:
+        return np.full(len(points), half)
+    distance = np.linalg.norm(points - np.array(space.centre), axis=1) / space.scale
+    return 2 * half * np.maximum(distance, 1) ** 2
 
 
 def seen_by_cameras(space: Space, n: int, cameras: list[tuple[Camera, np.ndarray]], least: int = 1) -> np.ndarray:
@@ -92,38 +103,43 @@ def finer(
 
 
 class OccupancyEstimate:
-    """A running maximum of the density in every cell (Instant-NGP's update), for training."""
+    """A running maximum of the density in every cell (Instant-NGP's update), for training.
+
+    allowed, occupied: (n, n, n) bool, the cells that may hold something and those that are marched through.
+    """
 
     def __init__(self, space: Space, n: int, allowed: np.ndarray, rng: np.random.Generator):
-        self.space, self.n, self.rng = space, n, rng
-        self.allowed = allowed.ravel()
-        self.candidates = np.flatnonzero(self.allowed)
-        self.estimate = np.zeros(n**3, np.float32)
+        self.space, self.rng, self.allowed = space, rng, allowed
+        self._candidates = np.flatnonzero(allowed)
+        self._estimate = np.zeros(n**3, np.float32)
+        self._held = np.zeros(0, np.int64)
         self.occupied = allowed.copy()
 
-    def update(
-        self,
-        densities: Callable[[np.ndarray], np.ndarray],
-        fraction: float,
-        decay: float = 0.95,
-        least: float = 0.01,
-    ) -> None:
-        """Look at a random `fraction` of the cells and at as many of the occupied ones; then threshold anew.
+    def hold(self, cells: np.ndarray) -> None:
+        """Keep flat cells (k,) occupied, whatever their density, instead of those held until now."""
+        self._held = cells
+        self._decide()
 
-        A cell is occupied where a step through it has an opacity of at least `least`, or more than the mean has.
-        """
-        count = max(1, int(len(self.candidates) * fraction))
-        cells = self.candidates
+    def update(self, densities: Callable[[np.ndarray], np.ndarray], fraction: float, decay: float = 0.95) -> None:
+        """Look at a random `fraction` of the cells and at as many of the occupied ones; then decide anew."""
+        count = max(1, int(len(self._candidates) * fraction))
+        cells = self._candidates
         if fraction < 1:
-            occupied = np.flatnonzero(self.occupied.ravel())
-            among = occupied if len(occupied) else self.candidates
-            cells = np.concatenate([self._some(self.candidates, count), self._some(among, min(count, len(among)))])
-        u = cell_positions(cells, self.n, self.rng.random((len(cells), 3), dtype=np.float32))
-        self.estimate *= decay
-        raise_to(self.estimate, cells, densities(u))
-        mean = float(self.estimate.sum(dtype=np.float64)) / len(self.candidates)
-        limit = min(least / self.space.step, mean)
-        self.occupied = (self.estimate > limit).reshape(self.n, self.n, self.n)
+            occupied = np.flatnonzero(self.occupied)
+            among = occupied if len(occupied) else self._candidates
+            cells = np.concatenate([self._some(self._candidates, count), self._some(among, min(count, len(among)))])
+        n = self.allowed.shape[0]
+        u = cell_positions(cells, n, self.rng.random((len(cells), 3), dtype=np.float32))
+        self._estimate *= decay
+        raise_to(self._estimate, cells, densities(u))
+        self._decide()
+
+    def _decide(self) -> None:
+        """A cell is occupied where a step through it is opaque enough, or more opaque than the mean is."""
+        mean = float(self._estimate.sum(dtype=np.float64)) / max(len(self._candidates), 1)
+        occupied = self._estimate > min(LEAST_OPACITY / self.space.step, mean)
+        occupied[self._held] = True
+        self.occupied = occupied.reshape(self.allowed.shape)
 
     def _some(self, cells: np.ndarray, count: int) -> np.ndarray:
         """Random ones, some of them perhaps twice: drawing without repeats would sort millions of cells."""

@@ -6,12 +6,13 @@ import numpy as np
 import torch
 from torch.nn.functional import huber_loss
 
+from fieldpose.stages.nerf.blocks import View
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.field import new_net
 from fieldpose.stages.nerf.kernels.types import Net
 from fieldpose.stages.nerf.metadata import Space
 from fieldpose.stages.nerf.optimiser import BETA1, BETA2, EPSILON
-from fieldpose.stages.nerf.raybank import Batch, View
+from fieldpose.stages.nerf.raybank import Batch
 from fieldpose.stages.nerf.training import Learner
 from fieldpose.stages.nerf.twin import TwinField, distortion_loss
 
@@ -45,7 +46,7 @@ class TorchTrainer(Learner):
             parts = [self._twin.densities(part).cpu() for part in self._tensor(u).split(DENSITY_CHUNK)]
         return torch.cat(parts).numpy()
 
-    def learn(self, batch: Batch, jitter: np.ndarray, rate: float) -> tuple[float, int]:
+    def learn(self, batch: Batch, jitter: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray, int]:
         """See Learner."""
         for group in self._adam.param_groups:
             group["lr"] = rate
@@ -60,8 +61,9 @@ class TorchTrainer(Learner):
         self._adam.zero_grad()
         (loss / len(jitter)).backward()
         self._adam.step()
-        squared = float(((rays.rgb.detach() - target) ** 2).sum())
-        return squared, int(samples.valid.sum())
+        errors = ((rays.rgb.detach() - target) ** 2).sum(dim=1)
+        depths = torch.where(rays.opacity.detach() > 0.5, rays.depth.detach(), 0)
+        return errors.cpu().numpy(), depths.cpu().numpy(), int(samples.valid.sum())
 
     def _tensor(self, array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(array, device=self._twin.device)

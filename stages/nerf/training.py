@@ -12,16 +12,19 @@ import numpy as np
 
 from fieldpose.stages.geometry import camera_centre
 from fieldpose.stages.geometry.cameras import rays
+from fieldpose.stages.nerf.blocks import View
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.datasets.bounds import nearest_point_to_axes
+from fieldpose.stages.nerf.exploration import POSSIBLE, SURE, due, missing, silhouettes
 from fieldpose.stages.nerf.field import Field, domain_of, new_net
+from fieldpose.stages.nerf.hull import hull
 from fieldpose.stages.nerf.kernels.density import densities
 from fieldpose.stages.nerf.kernels.train import train
 from fieldpose.stages.nerf.kernels.types import Net
 from fieldpose.stages.nerf.metadata import FieldMetadata, Space
 from fieldpose.stages.nerf.occupancy import OccupancyEstimate, near_cameras, seen_by_cameras
 from fieldpose.stages.nerf.optimiser import Optimiser
-from fieldpose.stages.nerf.raybank import Batch, RayBank, View
+from fieldpose.stages.nerf.raybank import Batch, RayBank
 from fieldpose.stages.nerf.renderer import NumbaRenderer
 from fieldpose.stages.nerf.workers import Workers
 
@@ -34,6 +37,7 @@ OFTEN, SETTLED = 256, 1024
 OCCUPANCY_EVERY = (16, 32, 64)
 FREE_SHARE = 0.2
 DISTORTION = {False: 1e-2, True: 5e-2}
+REWEIGH_EVERY = 32
 STRIDE = {False: 1.5, True: 1.0}
 """Training steps are longer than rendering's, by whether space is contracted: their jitter makes up for it."""
 FIRST_RAYS, RAYS = 512, (256, 1 << 15)
@@ -61,14 +65,21 @@ class Learner(ABC):
         self._rng = np.random.default_rng(config.seed)
         n = field.occupancy_resolution
         seen = seen_by_cameras(space, n, [(v.camera, v.cam_from_object) for v in views])
-        self._occupancy = OccupancyEstimate(self.space, n, seen & ~_before_lenses(views, space, n), self._rng)
+        allowed = seen & ~_before_lenses(views, space, n)
         self._bank = RayBank(views, space)
+        shown = silhouettes(views)
+        if shown:
+            allowed = hull(shown, space, allowed, POSSIBLE)
+            self._bank.blocks.use(space, allowed)
+        self._occupancy = OccupancyEstimate(self.space, n, allowed, self._rng)
+        if shown:
+            self._occupancy.hold(np.flatnonzero(hull(shown, space, allowed, SURE)))
         self._rays = FIRST_RAYS
         self.samples = self.steps = 0
 
     @abstractmethod
-    def learn(self, batch: Batch, jitter: np.ndarray, rate: float) -> tuple[float, int]:
-        """Take one optimisation step; returns the batch's summed squared error and the samples evaluated."""
+    def learn(self, batch: Batch, jitter: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray, int]:
+        """Take one optimisation step; returns each ray's squared error and depth (0: none), and the samples."""
 
     @abstractmethod
     def densities(self, u: np.ndarray) -> np.ndarray:
@@ -90,10 +101,15 @@ class Learner(ABC):
         """One batch at a `fraction` 0..1 of the schedule; returns its mean squared error."""
         if self.steps % OCCUPANCY_EVERY[(self.steps >= OFTEN) + (self.steps >= SETTLED)] == 0:
             self.look_again()
+        if due(self.steps, fraction):
+            self.look_for_missing()
+        if self.steps % REWEIGH_EVERY == 0:
+            self._bank.blocks.reweigh()
         rate = self.config.learning_rate * (self.config.final_learning_rate / self.config.learning_rate) ** fraction
         batch = self._bank.draw(self._rng, self._rays)
-        squared, evaluated = self.learn(batch, self._rng.random(self._rays, dtype=np.float32), rate)
-        mse = squared / (3 * self._rays)
+        errors, depths, evaluated = self.learn(batch, self._rng.random(self._rays, dtype=np.float32), rate)
+        mse = float(errors.mean()) / 3
+        self._bank.blocks.learnt(batch.block, errors, depths)
         self.steps += 1
         self.samples += evaluated
         self._adapt(evaluated / self._rays)
@@ -104,6 +120,13 @@ class Learner(ABC):
         share = 1.0 if self.steps == 0 else (0.25 if self.steps < OFTEN else 1 / 8)
         self._occupancy.update(self.densities, share)
         self.occupancy_changed(self._occupancy.occupied)
+
+    def look_for_missing(self) -> None:
+        """Have cells marched through, until this is called again, where the images show what the field does not."""
+        occupancy = self._occupancy
+        empty = occupancy.allowed & ~occupancy.occupied
+        occupancy.hold(missing(self._bank.blocks, self.space, empty, int(occupancy.occupied.sum())))
+        self.occupancy_changed(occupancy.occupied)
 
     def _adapt(self, samples_per_ray: float) -> None:
         wanted = self.config.samples_per_step / max(samples_per_ray, 1.0)
@@ -144,7 +167,8 @@ class Trainer(Learner):
         """Meet the kernels once without work, so that compiling them takes no training time."""
         nothing = np.zeros((0, 3), np.float32)
         self.densities(nothing)
-        self._gradients(Batch(nothing, nothing, nothing, nothing), np.zeros(0, np.float32))
+        none = np.zeros(0, np.float32)
+        self._gradients(Batch(nothing, nothing, nothing, nothing, np.zeros(0, np.int64)), none, none, none)
         self._optimiser.compile()
 
     def net(self) -> Net:
@@ -161,25 +185,27 @@ class Trainer(Learner):
         self._workers.each(len(u), 4096, lambda s, a, b: densities(self._net, u, a, b, s.samples, out))
         return out
 
-    def learn(self, batch: Batch, jitter: np.ndarray, rate: float) -> tuple[float, int]:
+    def learn(self, batch: Batch, jitter: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray, int]:
         """See Learner."""
-        done = self._gradients(batch, jitter)
+        errors, depths = np.zeros(len(jitter), np.float32), np.zeros(len(jitter), np.float32)
+        evaluated = self._gradients(batch, jitter, errors, depths)
         self._optimiser.step(rate, self._workers)
-        return sum(squared for squared, _ in done), sum(evaluated for _, evaluated in done)
+        return errors, depths, evaluated
 
-    def _gradients(self, batch: Batch, jitter: np.ndarray) -> list[tuple[float, int]]:
+    def _gradients(self, batch: Batch, jitter: np.ndarray, errors: np.ndarray, depths: np.ndarray) -> int:
         n = len(jitter)
         # As many rays as fill the second-level cache with what the backward pass needs of their samples.
         packet = int(np.clip(PACKET_ROWS * n / self.config.samples_per_step, 4, PACKET))
         delta, spread = np.float32(self.config.huber_delta), np.float32(self.distortion)
-        return self._workers.split(
+        done = self._workers.split(
             n,
             lambda s, a, b: train(
                 self._net, self._domain, batch.origins, batch.directions, jitter, batch.background, batch.target,
                 a, b, packet, PER_RAY, STOP_BELOW, delta, spread, np.float32(1 / max(n, 1)),
-                s.samples, s.rays, self._optimiser.gradients[s.index],
+                s.samples, s.rays, self._optimiser.gradients[s.index], errors, depths,
             ),
-        )  # type: ignore[return-value]  # fmt: skip
+        )  # fmt: skip
+        return sum(done)  # type: ignore[arg-type]
 
 
 def _before_lenses(views: list[View], space: Space, n: int) -> np.ndarray:

@@ -138,8 +138,12 @@ def every_message() -> dict[Topic[Any], Message]:
         ),
         topics.FAILURE: failure(3),
         topics.FOLLOWED: Followed(
-            header=header, **pose, pixels_in_frame=np.zeros((2, 2), np.float32), found=np.array([True, False]),
-            residual_px=0.3, level=1,
+            header=header,
+            **pose,
+            pixels_in_frame=np.zeros((2, 2), np.float32),
+            found=np.array([True, False]),
+            residual_px=0.3,
+            level=1,
         ),
         topics.STATE: State(
             header=header,

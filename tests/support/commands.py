@@ -20,9 +20,7 @@ def command(*arguments: object) -> list[str]:
 
 def fieldpose(*arguments: object, cwd: Path, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
     """Run `fieldpose` in a folder, to its end."""
-    return subprocess.run(
-        command(*arguments), cwd=cwd, timeout=timeout_s, capture_output=True, text=True
-    )
+    return subprocess.run(command(*arguments), cwd=cwd, timeout=timeout_s, capture_output=True, text=True)
 
 
 def save_empty_field(path: Path) -> Path:

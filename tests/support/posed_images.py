@@ -44,11 +44,12 @@ def seen_at(camera: Camera, cam_from_object: np.ndarray, point: np.ndarray = POI
 
 
 def picture(camera: Camera, cam_from_object: np.ndarray, channels: int = 3) -> np.ndarray:
-    """(h, w, channels) uint8: a round dot at POINT's pixel; with alpha, nothing but the dot."""
+    """(h, w, channels) uint8: a round dot at POINT's pixel, on a ramp of red; with alpha, nothing but the dot."""
     away = np.linalg.norm(camera.grid() - seen_at(camera, cam_from_object), axis=1).reshape(camera.height, -1)
     dot = np.rint(255 * np.exp(-((away / 4) ** 2))).astype(np.uint8)
     if channels == 3:
-        return np.repeat(dot[..., None], 3, axis=2)
+        ramp = np.broadcast_to(np.linspace(0, 90, dot.shape[1]).astype(np.uint8), dot.shape)  # no plain background
+        return np.dstack([np.maximum(dot, ramp), dot, dot])
     return np.concatenate([np.full((*dot.shape, 3), 200, np.uint8), dot[..., None]], axis=2)
 
 

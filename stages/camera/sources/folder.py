@@ -14,7 +14,7 @@ from fieldpose.stages.camera.calibration import Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.images import shrunk_with_camera
-from fieldpose.stages.nerf.datasets.images import EXTENSIONS, load_pixels, over_background, probe
+from fieldpose.stages.nerf.datasets.images import EXTENSIONS, WHITE, load_pixels, over_background, probe
 
 _ORIENTATION = 0x0112
 
@@ -50,7 +50,7 @@ def _read(frame_id: int, path: Path, config: CameraConfig, calibrator: Calibrato
         encoded = np.frombuffer(path.read_bytes(), np.uint8)
         return CapturedFrame(frame_id, encoded, "jpeg", camera, path.name, origin=origin)
     try:
-        pixels = over_background(load_pixels(path, width, height, probe(path).has_alpha), "white")
+        pixels = over_background(load_pixels(path, width, height, probe(path).has_alpha), WHITE)
     except DatasetError as error:
         raise SourceError(str(error)) from error
     image, camera = shrunk_with_camera(pixels, camera, config.size)

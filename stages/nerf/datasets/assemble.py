@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -48,19 +49,21 @@ def assemble(root: Path, draft: Draft, split: Split) -> Dataset:
         raise DatasetError(f"{root}: the {split} split is empty; choose another split or holdout, or add images")
     train = [record for record in draft.records if record.split == "train"] or draft.records
     transparent = _is_transparent(draft.records)
-    scene: Scene = "object" if transparent else "unbounded" if draft.aabb is None else "bounded"
+    background = images.WHITE if transparent else images.plain_background([partial(_shown, r) for r in train])
+    scene: Scene = "object" if background else "unbounded" if draft.aabb is None else "bounded"
     return Dataset(
         root=root,
         kind=draft.kind,
         scene=scene,
-        background="white" if transparent else None,
+        background=background,
         images=chosen,
         bounds=_bounds(scene, draft, train),
         unit=draft.unit,
+        has_alpha=transparent,
         scale=draft.scale,
         metres_per_unit=draft.metres_per_unit,
         object_aabb=None if draft.object_aabb is None else np.array(draft.object_aabb, dtype=np.float64),
-        notes=draft.notes,
+        notes=draft.notes + (_plain_note(background) if background and not transparent else ()),
     )
 
 
@@ -71,6 +74,14 @@ def _bounds(scene: Scene, draft: Draft, train: list[ImageRecord]) -> SceneBounds
     if scene == "object":
         return object_bounds([record.camera for record in train], poses)
     return unbounded_bounds(poses, draft.depths)
+
+
+def _shown(record: ImageRecord) -> np.ndarray:
+    return images.load_pixels(record.path, *_size(record), alpha=False)
+
+
+def _plain_note(colour: images.Colour) -> tuple[str, ...]:
+    return (f"the images show an object on a plain background, RGB {colour}, which is not learnt",)
 
 
 def _is_transparent(records: list[ImageRecord]) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -14,6 +14,11 @@ from PIL import Image
 from fieldpose.errors import DatasetError
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+Colour = tuple[int, int, int]
+WHITE: Colour = (255, 255, 255)
+PLAIN_WITHIN, PLAIN_SHARE, PLAIN_BORDER = 6, 0.95, 0.02
+"""How far levels of a plain background may be from its colour (JPEG's noise), in which share of the pixels along an
+image's border, which is so wide, as a share of the image. The object may reach into a twentieth of it."""
 _Result = TypeVar("_Result")
 
 
@@ -58,12 +63,39 @@ def load_mask(path: Path, width: int, height: int) -> np.ndarray:
     return _resize_nearest(grey, width, height) > 127
 
 
-def over_background(rgba: np.ndarray, background: str | None) -> np.ndarray:
-    """Lay (h, w, 4) uint8 over "white" or "black" (None: black); (h, w, 3) comes back as it is."""
+def plain_background(load: Sequence[Callable[[], np.ndarray]]) -> Colour | None:
+    """The one colour that surrounds what all images, (h, w, 3) uint8, show; None if there is none.
+
+    Later images are not loaded once one has another border.
+    """
+    colour, shows_something = None, False
+    for image in load:
+        pixels = image().astype(np.int16)
+        if colour is None:
+            colour = np.median(_border(pixels), axis=0)
+        if (np.abs(_border(pixels) - colour).max(axis=1) <= PLAIN_WITHIN).mean() < PLAIN_SHARE:
+            return None
+        shows_something |= bool((np.abs(pixels - colour) > PLAIN_WITHIN).any())
+    if colour is None or not shows_something:
+        return None
+    red, green, blue = (int(v) for v in np.rint(colour))
+    return red, green, blue
+
+
+def _border(image: np.ndarray) -> np.ndarray:
+    """Pixels (n, 3) along the border of an image (h, w, 3)."""
+    wide = max(1, round(PLAIN_BORDER * min(image.shape[:2])))
+    inner = np.zeros(image.shape[:2], bool)
+    inner[wide:-wide, wide:-wide] = True
+    return image[~inner]
+
+
+def over_background(rgba: np.ndarray, background: Colour | None) -> np.ndarray:
+    """Lay (h, w, 4) uint8 over a colour (None: black); (h, w, 3) comes back as it is."""
     if rgba.shape[-1] == 3:
         return rgba
     alpha = rgba[..., 3:].astype(np.float32) / 255
-    colour = rgba[..., :3] * alpha + (255 if background == "white" else 0) * (1 - alpha)
+    colour = rgba[..., :3] * alpha + np.array(background or (0, 0, 0), np.float32) * (1 - alpha)
     return np.rint(colour).astype(np.uint8)
 
 
@@ -117,4 +149,4 @@ def _resize_nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
 def load_photo(path: Path) -> np.ndarray:
     """The pixels (h, w, 3) uint8 RGB of an image file, transparent parts laid over white. Raises DatasetError."""
     header = probe(path)
-    return over_background(load_pixels(path, header.width, header.height, header.has_alpha), "white")
+    return over_background(load_pixels(path, header.width, header.height, header.has_alpha), WHITE)

@@ -45,18 +45,20 @@ class ImageRecord:
 class Dataset:
     """Posed photographs of one scene; methods may be called from several threads at once.
 
-    scene: "object" (images with alpha; background says what to lay them over), "bounded" (all inside bounds.aabb)
-    or "unbounded". scale: object units per unit of the dataset's own files. object_aabb: (2, 3), where the dataset
-    names one object in its scene. notes: what a user should be told, one line each.
+    scene: "object" (cut out by the images' alpha channel, if has_alpha, else on a plain background), "bounded" (all
+    inside bounds.aabb) or "unbounded". background: what is behind an object, or is to be laid behind it. scale: object
+    units per unit of the dataset's own files. object_aabb: (2, 3), where the dataset names one object in its scene.
+    notes: what a user should be told, one line each.
     """
 
     root: Path
     kind: Kind
     scene: Scene
-    background: Literal["white", "black"] | None
+    background: images.Colour | None
     images: tuple[ImageRecord, ...]
     bounds: SceneBounds
     unit: str
+    has_alpha: bool = False
     scale: float = 1.0
     metres_per_unit: float | None = None
     object_aabb: np.ndarray | None = None
@@ -64,11 +66,6 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.images)
-
-    @property
-    def has_alpha(self) -> bool:
-        """Whether load_image gives four channels."""
-        return self.scene == "object"
 
     def load_image(self, index: int) -> np.ndarray:
         """Image (h, w, 3 or 4) uint8 RGB(A) at its camera's size. DatasetError if the file cannot be decoded."""

@@ -64,15 +64,17 @@ def train(
     samples: Samples,
     rays: Rays,
     grads: Gradients,
-) -> tuple[float, int]:
-    """Add the gradients of rays first..last; return their summed squared error and the samples evaluated.
+    errors: np.ndarray,
+    depths: np.ndarray,
+) -> int:
+    """Add the gradients of rays first..last, fill their squared errors and depths; return the samples evaluated.
 
     `packet` rays are traced together, at most as many as `rays` has room for. The loss is Huber's of the colour
     against `target` (n, 3), already over the ray's `background` (n, 3), times `scale`, plus the distortion loss.
     """
     size = min(packet, rays.t.shape[0])
     drgb = np.empty((size, 3), np.float32)
-    squared, total = 0.0, 0
+    total = 0
     for start in range(first, last, size):
         count = min(size, last - start)
         rows, evaluated = forward(
@@ -81,14 +83,16 @@ def train(
         total += evaluated
         rows = compact(samples, rays, rows)
         for r in range(count):
+            squared = np.float32(0)
             for c in range(3):
                 error = shade(rays, r, c, background[start + r, c]) - target[start + r, c]
                 squared += error * error
                 drgb[r, c] = scale * max(-huber_delta, min(huber_delta, error))
+            errors[start + r], depths[start + r] = squared, rays.median[r]
             shade_backward(rays, r, background[start + r], drgb[r])
         colour_backward(net, rays, count, drgb)
         composite_backward(samples, rays, count, distortion * scale, dom.contracted)
         if rows > 0:
             density_backward(net, samples, rows)
         accumulate(net, samples, rays, rows, count, grads)
-    return squared, total
+    return total

@@ -30,7 +30,7 @@ def assert_poses(dataset: Dataset, poses: list[np.ndarray]) -> None:
 def test_blender(tmp_path: Path) -> None:
     poses = made.write_blender(tmp_path, SQUARE)
     train, test = load_dataset(tmp_path), load_dataset(tmp_path, "test")
-    assert (train.kind, train.scene, train.background, train.has_alpha) == ("blender", "object", "white", True)
+    assert (train.kind, train.scene, train.background, train.has_alpha) == ("blender", "object", (255, 255, 255), True)
     assert [record.name for record in train.images] == [f"train/r_{i}.png" for i in range(6)]
     assert_poses(train, poses[:6])
     assert_poses(test, poses[6:])
@@ -248,9 +248,7 @@ def test_llff_normalised_is_the_same_scene_seen_from_the_average_camera(tmp_path
     np.testing.assert_allclose(looking / np.linalg.norm(looking), (0, 0, -1), atol=1e-9)
     assert np.mean([pose[1, :3] for pose in found], axis=0)[1] < -0.9
     for i in (1, 4):
-        assert rotation_error_deg(found[0], found[i]) == pytest.approx(
-            rotation_error_deg(poses[0], poses[i]), abs=1e-6
-        )
+        assert rotation_error_deg(found[0], found[i]) == pytest.approx(rotation_error_deg(poses[0], poses[i]), abs=1e-6)
         scaled = translation_error(poses[0], poses[i]) * dataset.scale
         assert translation_error(found[0], found[i]) == pytest.approx(scaled)
     in_cam = poses[0] @ [*made.POINT, 1]

@@ -9,9 +9,7 @@ from fieldpose.stages.geometry import rays, translation_error
 from fieldpose.stages.nerf.datasets import load_dataset
 
 DEMO = Path(__file__).parents[3] / "recordings" / "demo"
-pytestmark = pytest.mark.skipif(
-    not (DEMO / "transforms_test.json").is_file(), reason="no demo scene in this checkout"
-)
+pytestmark = pytest.mark.skipif(not (DEMO / "transforms_test.json").is_file(), reason="no demo scene in this checkout")
 
 
 def test_the_demo_scene_is_a_bounded_one() -> None:
@@ -40,6 +38,4 @@ def test_depths_agree_between_views_and_lie_within_the_boxes(first: int) -> None
     lowest, highest = dataset.bounds.aabb
     assert ((points > lowest - 1e-3) & (points < highest + 1e-3)).all()
     lowest, highest = dataset.object_aabb
-    assert (
-        ((points > lowest - 0.01) & (points < highest + 0.01)).all(axis=1)[dataset.load_mask(first).ravel()].all()
-    )
+    assert ((points > lowest - 0.01) & (points < highest + 0.01)).all(axis=1)[dataset.load_mask(first).ravel()].all()

@@ -106,6 +106,10 @@ def kernels() -> Iterator[Finding]:
     from fieldpose.stages.nerf import kernels
 
     folder = cache_folder(Path(kernels.__file__).parent)
+    if folder is None:
+        mend = "every process compiles them; set NUMBA_CACHE_DIR to a folder that can be written to"
+        yield Finding("kernels", "note", "no folder can be written to that they could be kept in", mend)
+        return
     compiled = len(list(folder.rglob("*.nbi")))
     detail = f"{compiled} compiled, in {folder}" if compiled else "not compiled yet"
     mend = "" if compiled else "the first start takes half a minute longer"

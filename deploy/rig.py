@@ -113,7 +113,7 @@ def _cameras(settings: Settings, rig: Rig, sources: Sequence[str]) -> dict[str, 
     ]
     for name, table in rig.cameras.items():
         if not isinstance(table.get("source"), str):
-            raise ConfigError(f"{rig.origin}: {_OF_CAMERAS}.{name}: needs source = SOURCE, for instance \"camera:0\"")
+            raise ConfigError(f'{rig.origin}: {_OF_CAMERAS}.{name}: needs source = SOURCE, for instance "camera:0"')
         found.append((name, dict(table)))
     return _by_name(found, "camera", "no source of images; give --source, for instance --source folder:DIR")
 

@@ -7,7 +7,10 @@ So each state of a kernel's folder and of what kernels of all folders use has a 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable
+import os
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,8 +27,10 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """numba.njit with a cache, for kernels that use their folder's modules and SHARED_SOURCES alone."""
 
     def compiled(kernel: Callable[..., Any]) -> Any:
-        before = numba.config.CACHE_DIR
-        numba.config.CACHE_DIR = str(cache_folder(Path(kernel.__code__.co_filename).parent))
+        before, folder = numba.config.CACHE_DIR, cache_folder(Path(kernel.__code__.co_filename).parent)
+        if folder is None:
+            return numba.njit(**options)(kernel)
+        numba.config.CACHE_DIR = str(folder)
         try:
             return numba.njit(cache=True, **options)(kernel)
         finally:
@@ -34,9 +39,39 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
-def cache_folder(folder: Path) -> Path:
-    """Where the kernels of a folder are cached: in numba.config.CACHE_DIR, if it is set, else beside them."""
-    return Path(numba.config.CACHE_DIR or folder / "__pycache__") / f"kernels-{_state_of_folder(folder)}"
+def cache_folder(folder: Path) -> Path | None:
+    """Where the kernels of a folder are cached, None where nothing can be written: then each process compiles them.
+
+    In numba.config.CACHE_DIR, if it is set, else beside them, else in the user's cache, else in the user's own folder
+    for what is temporary.
+    """
+    name = f"kernels-{_state_of_folder(folder)}"
+    if numba.config.CACHE_DIR:
+        return Path(numba.config.CACHE_DIR) / name
+    found = next((place for place in _places(folder) if _is_writable(place)), None)
+    return None if found is None else found / name
+
+
+def _places(folder: Path) -> Iterator[Path]:
+    yield folder / "__pycache__"
+    with suppress(RuntimeError):  # no home
+        yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fieldpose"
+    temporary = Path(tempfile.gettempdir()) / f"fieldpose-{os.getuid()}"
+    with suppress(OSError):
+        temporary.mkdir(mode=0o700, exist_ok=True)
+        # What is cached is run: nobody else may have put it there.
+        if temporary.lstat().st_uid == os.getuid() and not temporary.lstat().st_mode & 0o022:
+            yield temporary
+
+
+@cache
+def _is_writable(place: Path) -> bool:
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=place):
+            return True
+    except OSError:
+        return False
 
 
 def state_of(sources: Iterable[Path]) -> str:

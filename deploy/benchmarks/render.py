@@ -16,6 +16,7 @@ import torch
 
 from fieldpose.deploy.benchmarks import machine
 from fieldpose.deploy.benchmarks.fields import kept_field
+from fieldpose.deploy.benchmarks.isa import instruction_set
 from fieldpose.deploy.benchmarks.memory import peak_mb
 from fieldpose.stages.geometry.cameras import rays
 from fieldpose.stages.nerf.blocks import View
@@ -76,6 +77,7 @@ def measure(
     view = _views(dataset, 400, 1)[0]
     return {
         "machine": machine.describe(),
+        "isa": instruction_set(),
         "field": {"file": path.name, "psnr_db": field.metadata.psnr_db, "mb": path.stat().st_size / 1e6},
         "limits": dataclasses.asdict(limit),
         "sizes": by_size,

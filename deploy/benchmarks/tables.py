@@ -31,7 +31,7 @@ def print_render(figures: dict[str, Any]) -> None:
     console.print(table)
     limits = figures["limits"]
     console.print(
-        f"{figures['machine']}: {2 * limits['multiply_adds_per_s'] / 1e9:.0f} GFLOP/s in small matrix products, "
+        f"{figures['machine']}, {figures['isa']}: {2 * limits['multiply_adds_per_s'] / 1e9:.0f} GFLOP/s in small matrix products, "
         f"{limits['reads_per_s'] / 1e6:.0f} M random reads/s; highest memory of a rendering process "
         f"{figures['rss_mb']:.0f} MB",
         highlight=False,
@@ -50,13 +50,10 @@ def print_train(figures: dict[str, Any]) -> None:
     console = result_console()
     seconds = sorted({float(s) for scores in figures["psnr_db"].values() for s in scores})
     console.print("PSNR on held-out views (dB) after so many seconds of training:")
-    table = Table()
-    table.add_column("dataset")
-    for second in seconds:
-        table.add_column(f"{second:g}", justify="right")
-    for name, scores in figures["psnr_db"].items():
-        table.add_row(name, *(f"{scores[f'{s:g}']:.2f}" if f"{s:g}" in scores else "" for s in seconds))
-    console.print(table)
+    console.print(_over_time(figures["psnr_db"], seconds, ".2f"))
+    if figures["silhouette_coverage"]:
+        console.print("share of the object's silhouette that the field shows there:")
+        console.print(_over_time(figures["silhouette_coverage"], seconds, ".1%"))
     console.print(
         f"{figures['machine']}: {figures['samples_per_s'] / 1e6:.2f} M samples/s, the plain twin "
         f"{figures['twin_samples_per_s'] / 1e6:.3f} M, {figures['speedup']:.1f} times faster; highest memory "
@@ -68,6 +65,16 @@ def print_train(figures: dict[str, Any]) -> None:
             f"{name}: error of depth within the object {error['median']:.2%} (median), {error['p90']:.2%} (90 %)",
             highlight=False,
         )
+
+
+def _over_time(courses: dict[str, dict[str, float]], seconds: list[float], form: str) -> Table:
+    table = Table()
+    table.add_column("dataset")
+    for second in seconds:
+        table.add_column(f"{second:g}", justify="right")
+    for name, values in courses.items():
+        table.add_row(name, *(f"{values[f'{s:g}']:{form}}" if f"{s:g}" in values else "" for s in seconds))
+    return table
 
 
 def print_match(figures: dict[str, Any]) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from fieldpose.deploy.benchmarks import machine
+from fieldpose.deploy.benchmarks.coverage import silhouette_coverage
 from fieldpose.deploy.benchmarks.depth import depth_error
 from fieldpose.deploy.benchmarks.fields import kept_field
 from fieldpose.deploy.benchmarks.memory import peak_mb
@@ -62,9 +63,11 @@ def _twin(views: list[View], metadata: FieldMetadata) -> Learner:
 
 @dataclass(frozen=True)
 class Course:
-    """PSNR in dB on held-out views by seconds of training, and the error of depth at the end (see depth_error)."""
+    """PSNR in dB and the share of the silhouette that is covered, on held-out views by seconds of training, and the
+    error of depth at the end (see silhouette_coverage, depth_error)."""
 
     psnr_db: dict[str, float]
+    coverage: dict[str, float]
     depth_error: dict[str, float] | None
 
 
@@ -80,7 +83,9 @@ def over_time(
     learner = Trainer(views, metadata.space, metadata.config, TrainingConfig())
     total = 60 * minutes
     checkpoints = [s for s in CHECKPOINTS_S if s < total] + [total]
+    test = load_dataset(dataset, "test", size)
     scores: dict[str, float] = {}
+    covered: dict[str, float] = {}
     errors = None
     spent = 0.0
     while checkpoints:
@@ -91,13 +96,16 @@ def over_time(
             seconds = checkpoints.pop(0)
             renderer = NumbaRenderer(learner.field(metadata), machine.cores())
             scores[f"{seconds:g}"] = float(np.mean(evaluate(renderer, some if checkpoints else held_out)))
+            share = silhouette_coverage(renderer, test)
+            if share is not None:
+                covered[f"{seconds:g}"] = share
             report(f"{dataset.resolve().name}: {scores[f'{seconds:g}']:.2f} dB after {seconds:g} s")
             if not checkpoints:
-                errors = depth_error(renderer, load_dataset(dataset, "test", size))
+                errors = depth_error(renderer, test)
                 final = replace_metadata(metadata, psnr_db=scores[f"{seconds:g}"], trained_seconds=spent)
                 learner.field(final).save(kept_field(out, dataset, size, minutes))
             renderer.close()
-    return Course(scores, errors)
+    return Course(scores, covered, errors)
 
 
 def _peak_mb(dataset: Path, size: int, model: FieldConfig, steps: int) -> float:
@@ -132,6 +140,7 @@ def measure(
         **rates,
         "rss_mb": memory,
         "psnr_db": {name: course.psnr_db for name, course in courses.items()},
+        "silhouette_coverage": {name: course.coverage for name, course in courses.items() if course.coverage},
         "depth_error": {name: course.depth_error for name, course in courses.items() if course.depth_error},
     }
 

@@ -12,6 +12,7 @@ from typing import Annotated
 import tyro
 
 from fieldpose.deploy.benchmarks import tables
+from fieldpose.deploy.benchmarks.isa import Isa, limited_to
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
 from fieldpose.deploy.scene import demo_file
 from fieldpose.errors import UsageError
@@ -28,7 +29,7 @@ class Render:
 
     Example: fieldpose bench render --json out/bench/render.json
 
-    The JSON file has: machine, field, limits, rss_mb, sizes (pixels of the longer side -> ms_per_view,
+    The JSON file has: machine, isa, field, limits, rss_mb, sizes (pixels of the longer side -> ms_per_view,
     twin_ms_per_view, speedup, psnr_loss_db, samples, samples_per_s, fraction_of_limit and more), steps, tables, rays.
     """
 
@@ -42,6 +43,8 @@ class Render:
     """Views of each size; one of those above 400 pixels, since the twin takes a minute there."""
     minutes: float = 5.0
     """Time to train for."""
+    isa: Isa = "native"
+    """Instructions that may be used: avx2 holds a machine that has AVX-512 to what older ones have."""
     out: Path = Path("out/bench")
     """Folder of the field and of the plot, render.png."""
     json: Path | None = None
@@ -54,7 +57,8 @@ class Render:
         dataset = self.dataset or _first_dataset()
         with progress_console().status("training the field") as status:
             path = render.field_of(self.field, dataset, 400, self.minutes, self.out)
-            figures = render.measure(path, dataset, self.sizes, self.views, _into(status.update, "bench render"))
+            report = _into(status.update, "bench render")
+            figures = limited_to(self.isa, render.measure, path, dataset, self.sizes, self.views, report)
         render.plot(figures, self.out / "render.png")
         write_json(self.json, figures)
         tables.print_render(figures)
@@ -69,6 +73,7 @@ class Train:
     Example: fieldpose bench train --json out/bench/train.json
 
     The JSON file has: machine, samples_per_s, twin_samples_per_s, speedup, rss_mb, psnr_db (dataset -> seconds -> dB),
+    silhouette_coverage (dataset with known outlines -> seconds -> share of the object's pixels that the field shows),
     depth_error (dataset with true depth -> median, p90: shares of the depth, within the object).
     """
 

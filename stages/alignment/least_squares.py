@@ -159,11 +159,34 @@ def normal_equations(
             hessian[b, a] = hessian[a, b]
 
 
+@njit(nogil=True)
+def order_statistic(values: np.ndarray, k: int) -> float:
+    """np.partition(values, k)[k] (Hoare's quickselect), which takes numba seconds less to compile."""
+    a = values.copy()
+    low, high = 0, a.shape[0] - 1
+    while low < high:
+        pivot, i, j = a[(low + high) // 2], low, high
+        while i <= j:
+            while a[i] < pivot:
+                i += 1
+            while pivot < a[j]:
+                j -= 1
+            if i <= j:
+                a[i], a[j] = a[j], a[i]
+                i, j = i + 1, j - 1
+        if k <= j:
+            high = j
+        elif k >= i:
+            low = i
+        else:
+            break
+    return a[k]
+
+
 @cached_njit(nogil=True)
 def huber_delta(lengths: np.ndarray) -> float:
     """Up to which length of weighted residuals (n,) Huber's loss is quadratic."""
-    middle = lengths.shape[0] // 2
-    return max(_HUBER * np.partition(lengths, middle)[middle] / _MEDIAN_TO_SIGMA, 1e-6)
+    return max(_HUBER * order_statistic(lengths, lengths.shape[0] // 2) / _MEDIAN_TO_SIGMA, 1e-6)
 
 
 @njit(nogil=True)

@@ -80,6 +80,7 @@ def test_training_is_measured_over_time(dataset: Path, tmp_path: Path, capsys: p
     assert list(written["psnr_db"]["data"]) == ["1.2"]
     assert written["rss_mb"] > 50
     assert written["depth_error"] == {}
+    assert 0 <= written["silhouette_coverage"]["data"]["1.2"] <= 1
     assert (tmp_path / "plots" / "train.png").read_bytes().startswith(b"\x89PNG")
     assert "PSNR on held-out views" in capsys.readouterr().out
 

@@ -1,6 +1,8 @@
 import ast
 import importlib
+import os
 import pkgutil
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +75,43 @@ def test_a_kernel_is_compiled_anew_once_what_it_shares_changes(
     assert len(caches) == 2
     assert all(Path(path).is_relative_to(tmp_path / "cache") for path in caches)
     assert str(tmp_path / "cache") == numba.config.CACHE_DIR
+
+
+def test_kernels_are_cached_where_something_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file stands where a folder would have to be, which stops even root."""
+    package, home, temporary = tmp_path / "package", tmp_path / "home", tmp_path / "temporary"
+    for folder in (package, home, temporary):
+        folder.mkdir()
+    (package / "kernel.py").write_text("X = 1\n")
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home))
+    monkeypatch.setattr(kernel_cache.tempfile, "gettempdir", lambda: str(temporary))
+    own = temporary / f"fieldpose-{os.getuid()}"
+    found = []
+    for blocked in (package / "__pycache__", home / "fieldpose", own, None):
+        kernel_cache._is_writable.cache_clear()
+        found.append(cache_folder(package))
+        if blocked is not None:
+            shutil.rmtree(blocked, ignore_errors=True)
+            blocked.write_text("")
+    kernel_cache._is_writable.cache_clear()
+    places = [None if folder is None else folder.parent for folder in found]
+    assert places == [package / "__pycache__", home / "fieldpose", own, None]
+
+
+def test_a_folder_that_others_may_write_to_is_not_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_cache.tempfile, "gettempdir", lambda: str(tmp_path))
+    own = tmp_path / f"fieldpose-{os.getuid()}"
+    assert own in kernel_cache._places(tmp_path)
+    own.chmod(0o777)
+    assert own not in kernel_cache._places(tmp_path)
+
+
+def test_without_a_cache_kernels_work_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_cache, "cache_folder", lambda folder: None)
+    kernel = cached_njit(nogil=True)(add)
+    assert kernel(1.0, 2.0) == 3.0
+    assert kernel.stats.cache_path is None
 
 
 def add(a: float, b: float) -> float:

@@ -17,7 +17,7 @@ def densities(net: Net, u: np.ndarray, first: int, last: int, samples: Samples, 
     for start in range(first, last, size):
         count = min(size, last - start)
         samples.u[:, :count] = u[start : start + count].T
-        density_network(net, samples, 0, count)
+        density_network(net, samples, np.int64(0), count)
         for s in range(count):
             out[start + s] = density(samples.out[s, 0])
 

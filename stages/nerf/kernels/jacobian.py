@@ -63,7 +63,7 @@ def ray_gradients(
     features = rays.feats.shape[1] - SH_SIZE
     for r in range(count):
         harmonics_gradient(directions[start + r], rays.dfeats[r], features, jacobian[start + r, k, 3:])
-    position_gradients(net, samples, 0, rows, du)
+    position_gradients(net, samples, np.int64(0), rows, du)
     for s in range(rows):
         cube_gradient(contracted, samples.y[s], du[:, s], dy)
         r = start + samples.ray[s]
@@ -101,7 +101,9 @@ def render_jacobian(
     du = np.empty((3, samples.t.shape[0]), np.float32)
     for start in range(first, last, size):
         count = min(size, last - start)
-        rows, _ = forward(net, dom, origins, directions, jitter, start, count, per_ray, stop_below, True, samples, rays)
+        rows, _ = forward(
+            net, dom, origins, directions, jitter, start, count, per_ray, stop_below, np.bool_(True), samples, rays
+        )
         rows = compact(samples, rays, rows)
         for r in range(count):
             for c in range(3):

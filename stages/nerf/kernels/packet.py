@@ -13,6 +13,7 @@ from fieldpose.stages.nerf.kernels.march import advance, begin
 from fieldpose.stages.nerf.kernels.types import SH_SIZE, Domain, Net, Rays, Samples
 from fieldpose.stages.nerf.kernels.vectors import float_of_bits
 
+# Numba compiles a function anew for each literal that it is called with: np.int64(0) and np.bool_(True) are none.
 MAX_EXPONENT, MIN_EXPONENT = np.float32(11.0), np.float32(-80.0)
 HALF = np.float32(0.5)
 LOG2_E = np.float32(1.4426950408889634)
@@ -172,9 +173,9 @@ def trace(
     rays: Rays,
 ) -> tuple[int, int]:
     """`forward`, of rays that have begun."""
-    row, evaluated = 0, 0
+    row, evaluated = np.int64(0), 0
     while True:
-        start = row if keep else 0
+        start = row if keep else np.int64(0)
         row = advance(dom, origins, directions, first, count, per_ray, start, rays, samples)
         if row == start:
             break

@@ -41,7 +41,7 @@ def accumulate(net: Net, samples: Samples, rays: Rays, rows: int, count: int, gr
     if rows > 0:
         grads.w2[:] += np.dot(samples.h[:rows].T, samples.dout[:rows])
         grads.w1[:] += np.dot(samples.x[:rows].T, samples.dh[:rows])
-        scatter(net, samples, 0, rows, grads.table)
+        scatter(net, samples, np.int64(0), rows, grads.table)
 
 
 @cached_njit(nogil=True, fastmath=FASTMATH)
@@ -78,7 +78,7 @@ def train(
     for start in range(first, last, size):
         count = min(size, last - start)
         rows, evaluated = forward(
-            net, dom, origins, directions, jitter, start, count, per_ray, stop_below, True, samples, rays
+            net, dom, origins, directions, jitter, start, count, per_ray, stop_below, np.bool_(True), samples, rays
         )
         total += evaluated
         rows = compact(samples, rays, rows)

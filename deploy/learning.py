@@ -33,7 +33,8 @@ def learn_field(
 ) -> TrainedField:
     """Learn, save, describe and examine a field; see train_field.
 
-    say: is told in a line where weights are missing, without which the field remembers nothing, or is not examined.
+    say: is told in a line where weights are missing, without which the field remembers nothing, or is not examined, and
+    what of the dataset a user should know.
     Raises DatasetError, ConfigError.
     """
     matching = matching or MatchingConfig()
@@ -41,6 +42,7 @@ def learn_field(
         dataset, out, size, holdout, training, model, report,
         lambda images: _described(images, matching, say),
         lambda field, images: _examined(field, images, matching, training, say),
+        say,
     )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ _AVX2 = {
 def instruction_set() -> str:
     """The widest vectors that kernels compiled in this process use, in words."""
     import numba
-    from llvmlite import binding
+    from llvmlite import binding  # type: ignore[import-untyped]
 
     if numba.config.CPU_FEATURES:
         features = {name[1:] for name in numba.config.CPU_FEATURES.split(",") if name.startswith("+")}

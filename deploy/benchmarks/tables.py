@@ -31,7 +31,8 @@ def print_render(figures: dict[str, Any]) -> None:
     console.print(table)
     limits = figures["limits"]
     console.print(
-        f"{figures['machine']}, {figures['isa']}: {2 * limits['multiply_adds_per_s'] / 1e9:.0f} GFLOP/s in small matrix products, "
+        f"{figures['machine']}, {figures['isa']}: {2 * limits['multiply_adds_per_s'] / 1e9:.0f} GFLOP/s in small "
+        "matrix products, "
         f"{limits['reads_per_s'] / 1e6:.0f} M random reads/s; highest memory of a rendering process "
         f"{figures['rss_mb']:.0f} MB",
         highlight=False,

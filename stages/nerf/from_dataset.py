@@ -116,16 +116,20 @@ def train_field(
     report: Callable[[TrainingReport], None] = lambda _: None,
     remember: Callable[[Iterable[np.ndarray]], np.ndarray | None] = lambda images: None,
     examine: Callable[[Field, Sequence[np.ndarray]], PoseAccuracy | None] = lambda field, images: None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> TrainedField:
     """Train on a dataset's training images, measure on its held-out ones, and save; Ctrl-C ends the training early.
 
     remember: makes the field's descriptors of the training images, (h, w, 3) uint8, or None if that cannot be.
     examine: finds out how well these are found in the field, or None if that cannot be; not where the training was
     ended early.
+    say: is told, a line each, what of the dataset a user should know.
     Raises DatasetError; nothing is written before the training is over.
     """
     training, config = training or TrainingConfig(), config or FieldConfig()
     dataset = load_dataset(path, "train", size, holdout=holdout)
+    for note in dataset.notes:
+        say(note)
     views = views_of(dataset)
     held_out = held_out_views(path, size, holdout)
     metadata = metadata_of(dataset, views, config)

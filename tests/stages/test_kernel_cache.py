@@ -61,9 +61,7 @@ def test_a_change_of_any_source_is_another_state(tmp_path: Path) -> None:
     assert len(set(states)) == 3
 
 
-def test_a_kernel_is_compiled_anew_once_what_it_shares_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_kernel_is_compiled_anew_once_what_it_shares_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shared, caches = tmp_path / "shared.py", set()
     monkeypatch.setattr(kernel_cache, "SHARED_SOURCES", (shared,))
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))

@@ -18,9 +18,7 @@ from fieldpose.stages.geometry import (
 from fieldpose.stages.geometry.cameras import distort
 
 # The phone camera of instant-ngp's fox, and one with every coefficient at work.
-PHONE = Camera(
-    1080, 1920, 1375.52, 1374.49, 554.058, 964.768, (0.0578421, -0.0805099, -0.000980296, 0.00015575, 0.0)
-)
+PHONE = Camera(1080, 1920, 1375.52, 1374.49, 554.058, 964.768, (0.0578421, -0.0805099, -0.000980296, 0.00015575, 0.0))
 BARREL = Camera(640, 480, 420.0, 415.0, 322.0, 236.0, (-0.25, 0.09, 0.002, -0.0015, -0.012))
 
 
@@ -140,9 +138,7 @@ def test_resizing_agrees_with_area_averaging() -> None:
     small = cv2.resize(image, (20, 15), interpolation=cv2.INTER_AREA)
     x, y = np.meshgrid(np.arange(20), np.arange(15))
     quarter = camera.shrunk(20)
-    assert (quarter.cx, quarter.cy) == pytest.approx(
-        ((small * x).sum() / small.sum(), (small * y).sum() / small.sum())
-    )
+    assert (quarter.cx, quarter.cy) == pytest.approx(((small * x).sum() / small.sum(), (small * y).sum() / small.sum()))
 
 
 @given(st.integers(1, 5000), st.integers(1, 5000), st.integers(1, 5000))
@@ -180,9 +176,7 @@ def test_rays_pass_through_the_projected_point_at_its_depth(camera: Camera, dept
     points = origins.astype(np.float64) + depth * directions
     in_cam = points @ cam_from_object[:3, :3].T + cam_from_object[:3, 3]
     np.testing.assert_allclose(in_cam[:, 2], depth, rtol=1e-4, atol=1e-5)
-    assert np.abs(camera.project(in_cam) - corners(camera)).max() < 1e-2 * max(1.0, camera.fx / 1000) / min(
-        depth, 1
-    )
+    assert np.abs(camera.project(in_cam) - corners(camera)).max() < 1e-2 * max(1.0, camera.fx / 1000) / min(depth, 1)
 
 
 def test_rays_of_all_pixels_follow_the_grid() -> None:

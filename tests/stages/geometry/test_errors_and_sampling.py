@@ -21,9 +21,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 @given(st.floats(0, 180), st.tuples(*[st.floats(-5, 5)] * 3))
-def test_errors_measure_the_angle_and_the_way_of_the_camera(
-    angle_deg: float, way: tuple[float, float, float]
-) -> None:
+def test_errors_measure_the_angle_and_the_way_of_the_camera(angle_deg: float, way: tuple[float, float, float]) -> None:
     turned = rotation_about((1, 2, -1), np.deg2rad(angle_deg)) @ POSE
     assert rotation_error_deg(POSE, turned) == pytest.approx(angle_deg, abs=1e-5)
     assert translation_error(POSE, turned) == pytest.approx(0, abs=1e-12)

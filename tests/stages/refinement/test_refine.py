@@ -108,10 +108,7 @@ def test_keypoint_guided_sampling_beats_uniform_under_occlusion(scene: AnalyticS
     errors = {}
     for region in ("keypoints", "image"):
         config = replace(CONFIG, region=region)
-        results = [
-            refine(scene, occluded, CAMERA, guess(seed), visible, config)
-            for seed in range(5)
-        ]
+        results = [refine(scene, occluded, CAMERA, guess(seed), visible, config) for seed in range(5)]
         errors[region] = np.array([error(result) for result in results])
     assert errors["keypoints"].max() < 0.1
     assert np.median(errors["keypoints"]) < 0.2 * np.median(errors["image"])
@@ -153,9 +150,7 @@ def test_nothing_to_compare_leaves_the_pose_as_it_is(scene: AnalyticScene, image
 
 
 def test_the_same_input_gives_the_same_pose(scene: AnalyticScene, image: np.ndarray, keypoints: np.ndarray) -> None:
-    first, second = (
-        refine(scene, image, CAMERA, guess(8), keypoints, CONFIG) for _ in range(2)
-    )
+    first, second = (refine(scene, image, CAMERA, guess(8), keypoints, CONFIG) for _ in range(2))
     assert np.array_equal(first.cam_from_object, second.cam_from_object)
 
 

@@ -14,8 +14,8 @@ NEAR = 0.05
 def silhouette_coverage(renderer: RayRenderer, dataset: Dataset) -> float | None:
     """Share of the object's area in all images that the field shows; None if its outline is not known.
 
-    The outline is that of the alpha channel, of which a pixel's opacity covers no more than it has; or of the mask, where
-    the depth tells whether the object is seen.
+    The outline is that of the alpha channel, of which a pixel's opacity covers no more than it has; or of the mask,
+    where the depth tells whether the object is seen.
     """
     shown = wanted = 0.0
     for index, record in enumerate(dataset.images):

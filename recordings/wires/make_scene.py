@@ -236,9 +236,9 @@ def make(out: Path, background: str, views: Views = Views(), seed: int = 0) -> N
                 save(out / frame["file_path"], np.rint(255 * opaque[..., ::-1]).astype(np.uint8))
             if split == "test" and background != "none":
                 depth = depth_map(world_from_camera, views, room)
-                frame |= {"depth_path": f"depth/{k:03d}.png", "mask_path": f"mask/{k:03d}.png"}
-                save(out / frame["depth_path"], np.rint(depth / DEPTH_SCALE).astype(np.uint16))
-                save(out / frame["mask_path"], (255 * (seen[..., 3] >= 0.5)).astype(np.uint8))
+                frame |= {"depth_file_path": f"depth/{k:03d}.png", "mask_file_path": f"mask/{k:03d}.png"}
+                save(out / frame["depth_file_path"], np.rint(depth / DEPTH_SCALE).astype(np.uint16))
+                save(out / frame["mask_file_path"], (255 * (seen[..., 3] >= 0.5)).astype(np.uint8))
             frames.append(frame)
         camera = {"camera_angle_x": math.radians(views.angle_deg), "w": views.size, "h": views.size}
         box = {} if background == "none" else {"aabb": (ROOM if room else BOX).tolist(), "depth_scale": DEPTH_SCALE}

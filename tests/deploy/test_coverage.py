@@ -17,7 +17,7 @@ from fieldpose.stages.nerf.rendering_api import RenderedView
 
 @dataclass
 class Shows:
-    """Renders the dataset's images one after the other, with so much of their opacity and at so many times the depth."""
+    """Renders the dataset's images one after the other, with some of their opacity and at so many times the depth."""
 
     dataset: Dataset
     opacity: float = 1.0
@@ -29,7 +29,8 @@ class Shows:
         alpha = pixels[..., 3] / 255 if self.dataset.has_alpha else np.ones(pixels.shape[:2])
         truth = np.zeros(pixels.shape[:2]) if self.dataset.has_alpha else self.dataset.load_depth(self.index)
         self.index += 1
-        return RenderedView(pixels[..., :3], self.depth * truth, self.opacity * alpha, camera, cam_from_object)
+        depth, opacity = (self.depth * truth).astype(np.float32), (self.opacity * alpha).astype(np.float32)
+        return RenderedView(pixels[..., :3], depth, opacity, camera, cam_from_object)
 
 
 @pytest.mark.parametrize(("opacity", "expected"), [(1.0, 1.0), (0.25, 0.25), (0.0, 0.0)])
@@ -43,7 +44,9 @@ def test_by_alpha_what_is_half_there_counts_by_half(tmp_path: Path, opacity: flo
 def test_by_mask_the_depth_has_to_be_the_objects(tmp_path: Path, depth: float, expected: float) -> None:
     made.write_blender(tmp_path, made.centred(24, 24, 30.0), channels=3, counts=(3, 1))
     made.edit_json(tmp_path / "transforms_train.json", aabb=[[-1, -1, -1], [1, 1, 1]])
-    made.edit_frame(tmp_path / "transforms_test.json", 0, depth_path="depth.npy", mask_path="mask.png", depth_scale=1.0)
+    made.edit_frame(
+        tmp_path / "transforms_test.json", 0, depth_file_path="depth.npy", mask_file_path="mask.png", depth_scale=1.0
+    )
     np.save(tmp_path / "depth.npy", np.full((24, 24), 3.0, np.float32))
     made.save(tmp_path / "mask.png", np.pad(np.full((10, 10), 255, np.uint8), 7))
     dataset = load_dataset(tmp_path, "test")

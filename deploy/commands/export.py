@@ -144,7 +144,7 @@ class Options:
 
 
 def _in_unit(region: Region, metadata: FieldMetadata) -> str:
-    return f"within {' x '.join(f'{side:.3g}' for side in region.box[1] - region.box[0])} ({metadata.unit})"
+    return f"within {' x '.join(f'{side:.3g}' for side in region.box[1] - region.box[0])} (lengths in: {metadata.unit})"
 
 
 def _megabytes(path: Path) -> str:

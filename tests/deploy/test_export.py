@@ -83,7 +83,7 @@ def test_a_ball_is_exported_as_mesh_and_points(field: Path, tmp_path: Path, caps
         assert np.einsum("ij,ij->i", values[:, 3:6], values[:, :3]).mean() > 0.8 * BALL_RADIUS
         assert np.abs(values[:, 6:] - RED).max() <= 2
     said = capsys.readouterr().out
-    assert f"{mesh}: {len(faces)} triangles, {len(vertices)} points, within 2 x 2 x 2 (span)" in said
+    assert f"{mesh}: {len(faces)} triangles, {len(vertices)} points, within 2 x 2 x 2 (lengths in: span)" in said
     assert f"{points}: " in said
     assert sorted(path.name for path in mesh.parent.iterdir()) == ["ball.ply", "points.ply"]
 

@@ -249,3 +249,17 @@ def _percent(share: float | None) -> str:
 
 def _three(percentiles: dict[str, float | None]) -> str:
     return "  ".join("-" if ms is None else f"{ms:.2f}" for ms in percentiles.values())
+
+
+def print_mesh(figures: dict[str, Any]) -> None:
+    """Distances and completeness of meshes, way by way."""
+    table = Table(title=f"mesh of {figures['field']}, {figures['resolution']} cells", title_justify="left")
+    for name in ("surface", "of", "median", "90 %", "complete", "triangles", "s"):
+        table.add_column(name, justify="left" if name in ("surface", "of") else "right")
+    for way, row in figures["ways"].items():
+        for part in ("all", "object"):
+            if (score := row.get(part)) is not None:
+                errors = (f"{score[name]:.4f}" for name in ("median", "p90"))
+                rest = (f"{score['complete']:.1%}", str(row["triangles"]), f"{row['seconds']:.0f}")
+                table.add_row(way, part, *errors, *rest)
+    result_console().print(table)

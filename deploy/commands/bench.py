@@ -13,6 +13,7 @@ import tyro
 
 from fieldpose.deploy.benchmarks import tables
 from fieldpose.deploy.benchmarks.isa import Isa, limited_to
+from fieldpose.deploy.commands.bench_mesh import Mesh
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
 from fieldpose.deploy.scene import demo_file
 from fieldpose.errors import UsageError
@@ -291,6 +292,7 @@ class Options:
         | Annotated[Bus, tyro.conf.subcommand("bus")]
         | Annotated[Track, tyro.conf.subcommand("track")]
         | Annotated[Start, tyro.conf.subcommand("start")]
+        | Annotated[Mesh, tyro.conf.subcommand("mesh")]
     ]
 
     def run(self) -> int:

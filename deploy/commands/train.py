@@ -16,11 +16,13 @@ import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
+from fieldpose.deploy.reporting.turntable import check_video, write_turntable
 from fieldpose.deploy.settings import overridden
 from fieldpose.stages.matching.core import MatchingConfig
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 
 if TYPE_CHECKING:
+    from fieldpose.stages.nerf.field import Field
     from fieldpose.stages.nerf.from_dataset import TrainedField, TrainingReport
 
 _LINE_EVERY_S = 30.0
@@ -54,6 +56,9 @@ class Options:
     holdout: Literal["auto", "odd", "every8", "none"] = "auto"
     """Which images of a dataset without splits of its own are held out: auto is odd for transforms.json, every8 for
     LLFF."""
+    turntable: str | None = None
+    """Write a video (.mp4) of what was learnt, three seconds around the object or along training views, into this file;
+    by default beside the field, under its name. none: write none."""
     json: Path | None = None
     """Write the figures into this file."""
     training: TrainingConfig = dataclasses.field(default_factory=TrainingConfig)
@@ -66,7 +71,9 @@ class Options:
         from fieldpose.deploy.evaluation.accuracy import in_words
         from fieldpose.deploy.learning import learn_field
 
+        turntable = self._turntable()
         check_writable(self.out, self.json)
+        check_video(turntable)
         training = overridden(self.training, minutes=self.minutes, backend=self.backend)
         holdout = None if self.holdout == "none" else self.holdout
         began = time.monotonic()
@@ -81,7 +88,23 @@ class Options:
         accuracy, unit = trained.field.metadata.accuracy, trained.field.metadata.unit
         if accuracy is not None:
             print(f"from the training view next to it, {in_words(accuracy)} (lengths in: {unit})")
+        if turntable is not None:
+            _show(trained.field, training.threads, turntable)
         return 0
+
+    def _turntable(self) -> Path | None:
+        if self.turntable is None:
+            return self.out.with_suffix(".mp4")
+        return None if self.turntable == "none" else Path(self.turntable)
+
+
+def _show(field: Field, threads: int, path: Path) -> None:
+    from fieldpose.stages.nerf.renderer import NumbaRenderer
+
+    renderer = NumbaRenderer(field, threads)
+    write_turntable(renderer, field.metadata, path)
+    renderer.close()
+    print(f"{path}: a video of what was learnt")
 
 
 def _say(text: str) -> None:

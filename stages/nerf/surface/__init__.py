@@ -1,0 +1,1 @@
+"""The surface that a field has learnt: as a mesh, and as points."""

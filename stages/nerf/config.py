@@ -25,7 +25,7 @@ class FieldConfig:
     """Resolutions of the hash grid."""
     level_features: int = 4
     """Features of a table entry."""
-    log2_table: int = 17
+    log2_table: int = 18
     """Entries of a level's table, as a power of two; coarse levels that need fewer are stored densely."""
     base_resolution: int = 16
     finest_resolution: int = 1024

@@ -232,7 +232,7 @@ def make(out: Path, background: str, views: Views = Views(), seed: int = 0) -> N
                 save(out / frame["file_path"], straight(seen))
             else:
                 plain = 0.0 if room or background == "black" else 1.0
-                opaque = seen[..., :3] + (1 - seen[..., 3:]) * plain * (not room)
+                opaque = seen[..., :3] + (1 - seen[..., 3:]) * plain
                 save(out / frame["file_path"], np.rint(255 * opaque[..., ::-1]).astype(np.uint8))
             if split == "test" and background != "none":
                 depth = depth_map(world_from_camera, views, room)

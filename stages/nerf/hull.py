@@ -50,8 +50,9 @@ def hull(
         distance_transform_edt(~m.pixels).astype(np.float32) if m.pixels.any() else np.full(m.pixels.shape, np.inf)
         for m in marked
     ]
-    n = among.shape[0]
-    m = min(COARSEST, n)
+    n = m = among.shape[0]
+    while m > COARSEST and m % 2 == 0:
+        m //= 2
     kept = np.ones((m, m, m), bool)
     while True:
         m = kept.shape[0]

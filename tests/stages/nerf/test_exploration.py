@@ -57,6 +57,14 @@ def test_the_hull_holds_the_object_and_little_else(seed: int, radius: float) -> 
     assert not found[away > 1.6 * (radius + cell + (SLACK_PX + 1) * pixel)].any()
 
 
+@pytest.mark.parametrize("n", [8, 24, 40, 72, 96])
+def test_the_grid_may_have_any_side_that_fields_may_have(n: int) -> None:
+    marked = [Marked(shadow(np.array(SPACE.centre), 0.5, CAMERA, pose), CAMERA, pose) for pose in around(6, 4.0, 1)]
+    found = hull(marked, SPACE, np.ones((n, n, n), bool), 0.0).ravel()
+    assert found[np.linalg.norm(centres(SPACE, n) - SPACE.centre, axis=1) < 0.5].all()
+    assert not found.all()
+
+
 @pytest.mark.parametrize("space", [SPACE, BALL])
 @pytest.mark.parametrize("hidden", [False, True])
 def test_hull_as_its_plain_twin(space: Space, hidden: bool) -> None:

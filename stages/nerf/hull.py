@@ -62,9 +62,8 @@ def hull(
         against, seeing = _votes(marked, away, points, cell_radii(space, m, points), slack)
         if m < n:  # more views may see a half
             seeing = np.full(len(cells), len(marked))
-        kept = np.zeros(m**3, bool)
-        kept[cells[(against <= contradicted * seeing) & (seeing >= seen_by)]] = True
-        kept = kept.reshape(m, m, m)
+        kept = np.zeros((m, m, m), bool)
+        kept.reshape(-1)[cells[(against <= contradicted * seeing) & (seeing >= seen_by)]] = True
         if m == n:
             return kept
         kept = kept.repeat(2, 0).repeat(2, 1).repeat(2, 2)

@@ -21,7 +21,7 @@ from fieldpose.deploy.benchmarks.memory import peak_mb
 from fieldpose.stages.nerf.blocks import View
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.datasets import load_dataset
-from fieldpose.stages.nerf.from_dataset import held_out_views, metadata_of, replace_metadata, views_of
+from fieldpose.stages.nerf.from_dataset import finished, held_out_views, metadata_of, replace_metadata, views_of
 from fieldpose.stages.nerf.metadata import FieldMetadata
 from fieldpose.stages.nerf.renderer import NumbaRenderer
 from fieldpose.stages.nerf.torch_training import TorchTrainer
@@ -94,7 +94,8 @@ def over_time(
         spent += time.perf_counter() - began
         if spent >= checkpoints[0]:
             seconds = checkpoints.pop(0)
-            renderer = NumbaRenderer(learner.field(metadata), machine.cores())
+            field = learner.field(metadata) if checkpoints else finished(learner, metadata, views)
+            renderer = NumbaRenderer(field, machine.cores())
             scores[f"{seconds:g}"] = float(np.mean(evaluate(renderer, some if checkpoints else held_out)))
             share = silhouette_coverage(renderer, test)
             if share is not None:
@@ -102,8 +103,8 @@ def over_time(
             report(f"{dataset.resolve().name}: {scores[f'{seconds:g}']:.2f} dB after {seconds:g} s")
             if not checkpoints:
                 errors = depth_error(renderer, test)
-                final = replace_metadata(metadata, psnr_db=scores[f"{seconds:g}"], trained_seconds=spent)
-                learner.field(final).save(kept_field(out, dataset, size, minutes))
+                field.metadata = replace_metadata(metadata, psnr_db=scores[f"{seconds:g}"], trained_seconds=spent)
+                field.save(kept_field(out, dataset, size, minutes))
             renderer.close()
     return Course(scores, covered, errors)
 

@@ -84,10 +84,8 @@ def near_cameras(space: Space, n: int, cameras: list[tuple[np.ndarray, float]]) 
     return near.reshape(m, m, m).repeat(2, 0).repeat(2, 1).repeat(2, 2)
 
 
-def finer(
-    occupied: np.ndarray, densities: Callable[[np.ndarray], np.ndarray], step: float, least: float = 0.02
-) -> np.ndarray:
-    """(2n, 2n, 2n) bool from (n, n, n): the halves of occupied cells through which a step is opaque enough.
+def finer(occupied: np.ndarray, densities: Callable[[np.ndarray], np.ndarray], step: float, least: float) -> np.ndarray:
+    """(2n, 2n, 2n) bool from (n, n, n): the halves of occupied cells through which a step has an opacity of `least`.
 
     Judged by the largest of the densities at 3 x 3 x 3 points of the smaller cell; `densities` takes points (k, 3) of
     the unit cube, `step` is that of a ray. Rays that end at a surface then begin nearer to it.

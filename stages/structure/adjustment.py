@@ -40,10 +40,10 @@ def supported(tracks: Tracks, images: int) -> Flags:
 def adjust(given: PosedCameras, tracks: Tracks, freedom: Freedom, start: PosedCameras | None = None) -> PosedCameras:
     """Cameras adjusted to tracks, in the given ones' frame and unit; `start` where other cameras are nearer already.
 
-    Images that show too few tracks stay as given, as does everything that `freedom` does not name. What is wrong of the
-    tracks is found as cameras get better: points are placed, observations far from them left out, cameras and points
-    adjusted, and so on until nothing changes. The same input has the same result. Raises GeometryError where what is
-    found makes no camera.
+    Images that show too few tracks keep their poses, and have the camera of those that were taken with it; what
+    `freedom` does not name stays as given. What is wrong of the tracks is found as cameras get better: points are
+    placed, observations far from them left out, cameras and points adjusted, and so on until nothing changes. The same
+    input has the same result. Raises GeometryError where what is found makes no camera.
     """
     images = supported(tracks, len(given))
     inner = _only(tracks, images)
@@ -57,7 +57,10 @@ def adjust(given: PosedCameras, tracks: Tracks, freedom: Freedom, start: PosedCa
         if round_ >= _FEWEST_ROUNDS and abs(before - error) <= _SETTLED * before:
             break
         now = _round(now, anchors, inner, found, freedom, round_ > 0)
-    return given.replaced(images, now)
+    of_given = dict(zip(anchors.cameras, now.cameras, strict=True))
+    poses = given.cam_from_object.copy()
+    poses[images] = now.cam_from_object
+    return PosedCameras(tuple(of_given.get(camera, camera) for camera in given.cameras), poses)
 
 
 def _round(

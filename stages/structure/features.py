@@ -25,7 +25,7 @@ _INSIDE_PX = 5
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Of one image: pixels (n, 2), descriptors (n, 128) float32 of length 1."""
+    """Of one image: pixels (n, 2), descriptors (n, 128) uint8."""
 
     pixels: Pixels64
     descriptors: np.ndarray
@@ -40,13 +40,18 @@ def find_keypoints(image: np.ndarray, most: int) -> Keypoints:
     create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV's stubs
     found, descriptors = create(contrastThreshold=_CONTRAST).detectAndCompute(grey, _inside(image))
     if descriptors is None:
-        return Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+        return Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.uint8))
     small = np.flatnonzero(np.array([keypoint.size for keypoint in found]) <= _LARGEST_PX)
     strength = np.array([found[i].response for i in small])
     chosen = small[np.argsort(-strength, kind="stable")[:most]]
     pixels = np.array([found[i].pt for i in chosen], np.float64).reshape(-1, 2)
-    kept = descriptors[chosen]
-    return Keypoints(pixels, np.sqrt(kept / np.maximum(kept.sum(axis=1, keepdims=True), 1e-9)))
+    return Keypoints(pixels, descriptors[chosen].astype(np.uint8))
+
+
+def root(descriptors: np.ndarray) -> np.ndarray:
+    """RootSIFT (n, 128) float32 of length 1, whose distances are those of the histograms that SIFT has."""
+    parts = descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True, dtype=np.float32), 1.0)
+    return np.sqrt(parts, dtype=np.float32)
 
 
 def _inside(image: np.ndarray) -> np.ndarray | None:

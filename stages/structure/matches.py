@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from fieldpose.stages.structure.features import Keypoints
+from fieldpose.stages.structure.features import Keypoints, root
 
 _RATIO = 0.8
 """Of the distances to the nearest descriptor and the second: nine of ten wrong matches have a greater one (Lowe)."""
@@ -36,7 +36,7 @@ def match_pairs(
 
     def matched(pair: tuple[int, int]) -> np.ndarray:
         first, second = keypoints[pair[0]], keypoints[pair[1]]
-        return _verified(first, second, _mutual(first.descriptors, second.descriptors))
+        return _verified(first, second, _mutual(root(first.descriptors), root(second.descriptors)))
 
     found = []
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(threads) as pool:

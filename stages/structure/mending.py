@@ -95,10 +95,11 @@ def mend(
     all cores. report: is told what is done and its share.
     """
     small = PosedCameras(tuple(camera.shrunk(LONGER_SIDE) for camera in given.cameras), given.cam_from_object)
-    tracks = find_tracks(small, load, threads or len(os.sched_getaffinity(0)), report)
+    threads = threads or len(os.sched_getaffinity(0))
+    tracks = find_tracks(small, load, threads, report)
     report("adjusting the cameras", 0.0)
     trained_px = trained_px or _longest(given)
-    return _at_full_size(mend_by_tracks(small, tracks, min(trained_px, _longest(given))), given)
+    return _at_full_size(mend_by_tracks(small, tracks, min(trained_px, _longest(given)), threads), given)
 
 
 def find_tracks(
@@ -123,7 +124,7 @@ def find_tracks(
     return join_tracks(keypoints, pairs, matches)
 
 
-def mend_by_tracks(given: PosedCameras, tracks: Tracks, trained_px: float) -> Mending:
+def mend_by_tracks(given: PosedCameras, tracks: Tracks, trained_px: float, threads: int = 1) -> Mending:
     """As mend, what the images share being known; trained_px by the sizes of the given cameras."""
     size_px = _longest(given)
     held_out = np.random.default_rng(0).random(tracks.count) < HELD_OUT
@@ -137,21 +138,22 @@ def mend_by_tracks(given: PosedCameras, tracks: Tracks, trained_px: float) -> Me
     if probe is None or not _seen(before, after, asked, PIXEL_BLUR * size_px / trained_px):
         verdict: Verdict = "no fit" if np.median(before) > FITTING_PX else "fit"
         return _report(verdict, given, given, tracks.count, ~enough, before, after)
-    best = _least_freed(given, probe, shown, asked)
+    best = _least_freed(given, probe, shown, asked, threads)
     after = triangulate(best, asked).error_px
     verdict = "no fit" if np.median(after) > FITTING_PX else "adjusted"
     return _report(verdict, given, best, tracks.count, ~enough, before, after)
 
 
-def _least_freed(given: PosedCameras, probe: PosedCameras, shown: Tracks, asked: Tracks) -> PosedCameras:
+def _least_freed(given: PosedCameras, probe: PosedCameras, shown: Tracks, asked: Tracks, threads: int) -> PosedCameras:
     """The probe, or cameras of which less or more is adjusted: more only where held-out tracks gain by it.
 
     A focal length that was right stays by that to the bit, and one that was wrong does not make up for distortion.
     """
     as_calibrated = PosedCameras(given.cameras, probe.cam_from_object)
-    candidates = [_adjusted(given, shown, "poses", as_calibrated), probe]
-    if all(map(can_bend, given.cameras)):
-        candidates.append(_adjusted(given, shown, "distortion", probe))
+    with ThreadPoolExecutor(threads) as pool:
+        less = pool.submit(_adjusted, given, shown, "poses", as_calibrated)
+        more = pool.submit(_adjusted, given, shown, "distortion", probe) if all(map(can_bend, given.cameras)) else None
+        candidates = [less.result(), probe, None if more is None else more.result()]
     possible = [candidate for candidate in candidates if candidate is not None]
     best = possible[0]
     for freer in possible[1:]:

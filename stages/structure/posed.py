@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.geometry.arrays import Flags, Transforms
 
@@ -24,9 +22,3 @@ class PosedCameras:
         """Those of the flagged images."""
         cameras = tuple(camera for camera, kept in zip(self.cameras, images, strict=True) if kept)
         return PosedCameras(cameras, self.cam_from_object[images])
-
-    def replaced(self, images: Flags, by: PosedCameras) -> PosedCameras:
-        """With `by` for the flagged images, in their order."""
-        cameras, poses = np.array(self.cameras, object), self.cam_from_object.copy()
-        cameras[images], poses[images] = np.array(by.cameras, object), by.cam_from_object
-        return PosedCameras(tuple(cameras.tolist()), poses)

@@ -98,7 +98,7 @@ def test_each_of_several_cameras_is_found() -> None:
     assert [camera.fx for camera in found.cameras[:2]] == pytest.approx([520, 700], rel=4e-3)
 
 
-def test_an_image_that_shares_little_stays_as_it_is() -> None:
+def test_an_image_that_shares_little_stays_where_it_is() -> None:
     truth = cameras_around(CAMERA, 24)
     tracks = shared(truth, 1500)
     of_first = np.flatnonzero(tracks.image == 0)
@@ -106,5 +106,5 @@ def test_an_image_that_shares_little_stays_as_it_is() -> None:
     given_ = with_focal(disturbed(truth, 0.5, 0.02), 1.1)
     found = adjust(given_, tracks.without(hidden), "focal")
     assert np.array_equal(found.cam_from_object[0], given_.cam_from_object[0])
-    assert found.cameras[0] == given_.cameras[0]
+    assert found.cameras[0] == found.cameras[1]
     assert not np.array_equal(found.cam_from_object[1], given_.cam_from_object[1])

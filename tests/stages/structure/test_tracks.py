@@ -19,7 +19,7 @@ CAMERA = Camera(320, 240, 250.0, 255.0, 159.5, 119.5, (-0.1, 0.02, 0.001, -0.001
 
 
 def blank(counts: list[int]) -> list[Keypoints]:
-    return [Keypoints(np.arange(2.0 * n).reshape(n, 2), np.zeros((n, 128), np.float32)) for n in counts]
+    return [Keypoints(np.arange(2.0 * n).reshape(n, 2), np.zeros((n, 128), np.uint8)) for n in counts]
 
 
 @given(st.integers(1, 60), st.integers(0, 5))

@@ -54,7 +54,7 @@ def in_words(fit: CameraFit, unit: str) -> str:
     images = f"(in images of {fit.size_px} px)"
     if fit.before_px is None or fit.after_px is None:
         return (
-            f"whether the cameras fit their images is not known: {len(fit.kept)} share too little with others;"
+            f"whether the cameras fit their images is not known: {len(fit.kept)} images share too little with others;"
             " photographs with more overlap, more texture or more pixels would tell"
         )
     if fit.verdict == "fit":
@@ -66,10 +66,13 @@ def in_words(fit: CameraFit, unit: str) -> str:
         )
     (turned, turned_most), (moved, moved_most), (before, after) = fit.rotation_deg, fit.translation, fit.focal_px
     focal = f"focal length {before:.1f} -> {after:.1f} px, " if before != after else ""
+    moved_by = (
+        f"{turned:.2f} degrees and {moved:.3g} in the median, {turned_most:.2f} and {moved_most:.3g} at most"
+        f" (lengths in: {unit})"
+    )
+    poses = moved_by if turned_most or moved_most else "poses stay"
     return (
-        f"cameras adjusted to their images: {turned:.2f} degrees and {moved:.3g} in the median, {turned_most:.2f} and"
-        f" {moved_most:.3g} at most (lengths in: {unit}), {focal}"
-        f"error {fit.before_px:.2f} -> {fit.after_px:.2f} px {images}"
+        f"cameras adjusted to their images: {poses}, {focal}error {fit.before_px:.2f} -> {fit.after_px:.2f} px {images}"
     )
 
 

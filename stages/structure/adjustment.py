@@ -71,8 +71,10 @@ def _round(
     placed = triangulate(now, fitting)
     wide = placed.angle_rad > _LEAST_ANGLE
     noise_px = error / MEDIAN_LENGTH
-    priors = _priors(now, anchors) if near else None
+    priors = _priors(now, anchors) if near and freedom != "focal alone" else None
     adjusted = bundle_adjust(now, placed.points[wide], fitting.chosen(wide), freedom, noise_px, priors)
+    if freedom == "focal alone":
+        return adjusted
     similarity = align(adjusted.cam_from_object, anchors.cam_from_object)
     return PosedCameras(adjusted.cameras, similarity.of_poses(adjusted.cam_from_object))
 

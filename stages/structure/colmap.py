@@ -6,6 +6,7 @@ revisited (2016). pycolmap is imported where it is used, since nothing else shou
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal
@@ -26,8 +27,9 @@ _ITERATIONS, _TOLERANCE = 50, 1e-6
 """Of one adjustment, among several: the cost changes by less than a millionth."""
 _ALIGNED_WITHIN_SIGMA = 10.0
 """COLMAP first brings the cameras into the priors' frame by those that can be within this of their priors."""
-Freedom = Literal["poses", "focal", "distortion"]
-"""What of the cameras is adjusted: their poses, the focal length besides, the distortion besides."""
+Freedom = Literal["focal alone", "poses", "focal", "distortion"]
+"""What of the cameras is adjusted: the focal length alone; their poses, the focal length besides, the distortion
+besides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,9 @@ def bundle_adjust(
     options, config = _options(freedom, noise_px), pycolmap.BundleAdjustmentConfig()
     for image_id in scene.images:
         config.add_image(image_id)
+    if freedom == "focal alone":
+        pycolmap.create_default_bundle_adjuster(options, config, scene).solve()
+        return PosedCameras(_cameras(scene, shared, given), given.cam_from_object)
     if priors is None:
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         pycolmap.create_default_bundle_adjuster(options, config, scene).solve()
@@ -72,10 +77,12 @@ def bundle_adjust(
         of_priors.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
         places = [_prior(scene, i + 1, centre, sigma) for i, centre in enumerate(priors.centres)]
         pycolmap.create_pose_prior_bundle_adjuster(options, of_priors, config, places, scene).solve()
-    return PosedCameras(
-        tuple(from_colmap(scene.camera(shared[camera]), camera) for camera in given.cameras),
-        np.stack([_matrix(scene.image(i + 1).cam_from_world()) for i in range(len(given.cameras))]),
-    )
+    poses = [_matrix(scene.image(i + 1).cam_from_world()) for i in range(len(given.cameras))]
+    return PosedCameras(_cameras(scene, shared, given), np.stack(poses))
+
+
+def _cameras(scene: pycolmap.Reconstruction, shared: Mapping[Camera, int], given: PosedCameras) -> tuple[Camera, ...]:
+    return tuple(from_colmap(scene.camera(shared[camera]), camera) for camera in given.cameras)
 
 
 def _options(freedom: Freedom, noise_px: float) -> pycolmap.BundleAdjustmentOptions:
@@ -83,6 +90,7 @@ def _options(freedom: Freedom, noise_px: float) -> pycolmap.BundleAdjustmentOpti
 
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
+    options.refine_rig_from_world = freedom != "focal alone"
     options.refine_focal_length = freedom != "poses"
     options.refine_principal_point = False
     options.refine_extra_params = freedom == "distortion"

@@ -23,7 +23,7 @@ from fieldpose.stages.structure.features import Keypoints, find_keypoints
 from fieldpose.stages.structure.matches import match_pairs
 from fieldpose.stages.structure.pairs import choose_pairs
 from fieldpose.stages.structure.posed import PosedCameras
-from fieldpose.stages.structure.tracks import Tracks, join_tracks
+from fieldpose.stages.structure.tracks import SHORTEST, Tracks, join_tracks
 from fieldpose.stages.structure.triangulation import triangulate
 
 LONGER_SIDE = 800
@@ -31,7 +31,8 @@ LONGER_SIDE = 800
 MOST_KEYPOINTS = 1500
 """Of an image. Twice as many leave cameras a tenth nearer to the truth (lego), in twice the time."""
 HELD_OUT = 0.2
-FEWEST_IMAGES = 3
+"""Of the tracks: of the few hundred that a small scene has, enough are left to adjust to, and to tell 5 % by."""
+FEWEST_IMAGES = SHORTEST
 LEAST_SUPPORTED = 0.5
 """Of the images: with fewer, what most of the field is learnt from would stay as it is."""
 PIXEL_BLUR = 1 / np.sqrt(12)
@@ -132,15 +133,16 @@ def mend_by_tracks(given: PosedCameras, tracks: Tracks, trained_px: float, threa
     enough = supported(shown, len(given))
     if enough.sum() < max(FEWEST_IMAGES, LEAST_SUPPORTED * len(given)) or asked.count == 0:
         return Mending("too few", given, size_px, tracks.count, ~enough)
-    before = triangulate(given, asked).error_px
-    probe = _adjusted(given, shown, "focal", given)
-    after = before if probe is None else triangulate(probe, asked).error_px
-    if probe is None or not _seen(before, after, asked, PIXEL_BLUR * size_px / trained_px):
-        verdict: Verdict = "no fit" if np.median(before) > FITTING_PX else "fit"
-        return _report(verdict, given, given, tracks.count, ~enough, before, after)
-    best = _least_freed(given, probe, shown, asked, threads)
-    after = triangulate(best, asked).error_px
-    verdict = "no fit" if np.median(after) > FITTING_PX else "adjusted"
+    with ThreadPoolExecutor(threads) as pool:
+        lens, probe = pool.map(lambda freedom: _adjusted(given, shown, freedom, given), ("focal alone", "focal"))
+    best = given if lens is None or not _gains(given, lens, asked) else lens
+    before, least = triangulate(given, asked).error_px, triangulate(best, asked).error_px
+    after = least if probe is None else triangulate(probe, asked).error_px
+    if probe is not None and _seen(least, after, asked, PIXEL_BLUR * size_px / trained_px):
+        best = _least_freed(given, probe, shown, asked, threads)
+    if best is not given:
+        after = least = triangulate(best, asked).error_px
+    verdict: Verdict = "no fit" if np.median(least) > FITTING_PX else "fit" if best is given else "adjusted"
     return _report(verdict, given, best, tracks.count, ~enough, before, after)
 
 
@@ -151,16 +153,20 @@ def _least_freed(given: PosedCameras, probe: PosedCameras, shown: Tracks, asked:
     """
     as_calibrated = PosedCameras(given.cameras, probe.cam_from_object)
     with ThreadPoolExecutor(threads) as pool:
-        less = pool.submit(_adjusted, given, shown, "poses", as_calibrated)
+        poses = pool.submit(_adjusted, given, shown, "poses", as_calibrated)
         more = pool.submit(_adjusted, given, shown, "distortion", probe) if all(map(can_bend, given.cameras)) else None
-        candidates = [less.result(), probe, None if more is None else more.result()]
+        candidates = [poses.result(), probe, None if more is None else more.result()]
     possible = [candidate for candidate in candidates if candidate is not None]
     best = possible[0]
     for freer in possible[1:]:
-        before, after = (triangulate(cameras, asked).error_px for cameras in (best, freer))
-        if np.median(after) < (1 - LEAST_GAIN) * np.median(before) and _surely(before, after, asked):
+        if _gains(best, freer, asked):
             best = freer
     return best
+
+
+def _gains(best: PosedCameras, freer: PosedCameras, asked: Tracks) -> bool:
+    before, after = (triangulate(cameras, asked).error_px for cameras in (best, freer))
+    return bool(np.median(after) < (1 - LEAST_GAIN) * np.median(before)) and _surely(before, after, asked)
 
 
 def _adjusted(given: PosedCameras, tracks: Tracks, freedom: Freedom, start: PosedCameras) -> PosedCameras | None:

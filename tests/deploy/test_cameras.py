@@ -109,7 +109,7 @@ def test_given_cameras_are_not_looked_at(tmp_path: Path, capsys: pytest.CaptureF
 def test_images_that_share_too_little_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     posed_images.write_blender(tmp_path, posed_images.centred(32, 32, 40.0))
     metadata = train(tmp_path)
-    assert "whether the cameras fit their images is not known: 9 share too little" in capsys.readouterr().err
+    assert "whether the cameras fit their images is not known: 9 images share too little" in capsys.readouterr().err
     assert metadata.camera_fit is not None
     assert metadata.camera_fit.verdict == "too few"
     assert np.array_equal(metadata.cameras[0].pose, load_dataset(tmp_path).images[0].cam_from_object)
@@ -137,9 +137,12 @@ def test_what_became_of_cameras_is_one_line() -> None:
     )
     calibrated = msgspec.structs.replace(adjusted, focal_px=(524.7, 524.7))
     assert "focal" not in in_words(calibrated, "metre")
+    lens = msgspec.structs.replace(adjusted, rotation_deg=(0.0, 0.0), translation=(0.0, 0.0))
+    assert "images: poses stay, focal length 576.7 -> 524.7 px, error" in in_words(lens, "metre")
     assert kept_in_words(adjusted) is None
-    assert kept_in_words(
-        msgspec.structs.replace(adjusted, kept=("a", "b"))
-    ) == "2 images share too little with others and keep their cameras, as blurred ones do: a, b"
+    assert (
+        kept_in_words(msgspec.structs.replace(adjusted, kept=("a", "b")))
+        == "2 images share too little with others and keep their cameras, as blurred ones do: a, b"
+    )
     assert "do not fit their images: 7.0 px" in in_words(CameraFit("no fit", **common), "metre")  # type: ignore[arg-type]
     assert "cameras fit their images: 6.96 px" in in_words(CameraFit("fit", **common), "metre")  # type: ignore[arg-type]

@@ -59,6 +59,14 @@ def test_a_wrong_focal_length_alone_is_mended() -> None:
     assert found.verdict == "adjusted"
     assert found.posed.cameras[0].fx == pytest.approx(520, rel=2e-3)
     assert found.posed.cameras[0].distortion == CAMERA.distortion
+    assert np.array_equal(found.posed.cam_from_object, AROUND.cam_from_object)
+
+
+def test_a_focal_length_that_depths_make_up_for_is_mended_too() -> None:
+    longer = msgspec.structs.replace(CAMERA, fx=1.02 * CAMERA.fx, fy=1.02 * CAMERA.fy)
+    found = mend_by_tracks(PosedCameras((longer,) * 24, AROUND.cam_from_object), TRACKS, 200)
+    assert found.verdict == "adjusted"
+    assert found.posed.cameras[0].fx == pytest.approx(520, rel=2e-3)
 
 
 def test_a_focal_length_that_is_right_stays_to_the_bit() -> None:

@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float64
 
 from fieldpose.stages.geometry import Camera, camera_centres
-from fieldpose.stages.geometry.arrays import Points64, Values
 from fieldpose.stages.structure.posed import PosedCameras
 from fieldpose.stages.structure.tracks import Tracks
 
@@ -21,6 +21,9 @@ _STEPS = 10
 _LEAST_RESIDUAL_PX = 0.5
 """Residuals count by their length, not its square, down to this, which is about how exact a keypoint is."""
 _DAMPING = 1e-6
+_TrackPoints = Float64[np.ndarray, "tracks 3"]
+_Angles = Float64[np.ndarray, "tracks"]
+_Errors = Float64[np.ndarray, "observations"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,9 +31,9 @@ class Triangulated:
     """points (tracks, 3) in object coordinates; error_px of each observation, infinite where the point is not ahead of
     the camera; angle_rad of each track: about the widest between two of its rays."""
 
-    points: Points64
-    error_px: Values
-    angle_rad: Values
+    points: _TrackPoints
+    error_px: _Errors
+    angle_rad: _Angles
 
 
 def triangulate(posed: PosedCameras, tracks: Tracks) -> Triangulated:

@@ -46,6 +46,9 @@ LEAST_GAIN = 0.05
 FITTING_PX = 3.0
 """Within this pairs of images agree, so cameras that leave more in the median do not explain them."""
 
+FARTHEST_DEG = 20.0
+"""In the median. Poses 15 degrees off still come right (fox); what turns cameras farther has followed something else,
+like the background of an object on a turntable."""
 _FAR_PX = 1e6
 """In place of the infinite error of a point behind its camera."""
 Verdict = Literal["fit", "adjusted", "too few", "no fit"]
@@ -142,7 +145,8 @@ def mend_by_tracks(given: PosedCameras, tracks: Tracks, trained_px: float, threa
         best = _least_freed(given, probe, shown, asked, threads)
     if best is not given:
         after = least = triangulate(best, asked).error_px
-    verdict: Verdict = "no fit" if np.median(least) > FITTING_PX else "fit" if best is given else "adjusted"
+    astray = np.median(least) > FITTING_PX or np.median(_turned_deg(given, best)) > FARTHEST_DEG
+    verdict: Verdict = "no fit" if astray else "fit" if best is given else "adjusted"
     return _report(verdict, given, best, tracks.count, ~enough, before, after)
 
 
@@ -196,8 +200,7 @@ def _report(
     verdict: Verdict, given: PosedCameras, found: PosedCameras, tracks: int, unsupported: Flags,
     before: Values, after: Values,
 ) -> Mending:  # fmt: skip
-    apart = zip(given.cam_from_object, found.cam_from_object, strict=True)
-    turned = np.array([rotation_error_deg(a, b) for a, b in apart])
+    turned = _turned_deg(given, found)
     moved = np.linalg.norm(camera_centres(given.cam_from_object) - camera_centres(found.cam_from_object), axis=1)
     adjusted = verdict == "adjusted"
     return Mending(
@@ -206,6 +209,11 @@ def _report(
         Spread(float(np.median(turned)), float(turned.max())) if adjusted else None,
         Spread(float(np.median(moved)), float(moved.max())) if adjusted else None,
     )  # fmt: skip
+
+
+def _turned_deg(given: PosedCameras, found: PosedCameras) -> Values:
+    apart = zip(given.cam_from_object, found.cam_from_object, strict=True)
+    return np.array([rotation_error_deg(a, b) for a, b in apart])
 
 
 def _longest(posed: PosedCameras) -> int:

@@ -90,6 +90,12 @@ def test_cameras_of_no_rigid_scene_are_kept() -> None:
     assert (found.verdict, found.posed is AROUND) == ("no fit", True)
 
 
+def test_cameras_do_not_follow_a_background_that_moves_otherwise() -> None:
+    still = PosedCameras(AROUND.cameras, cameras_around(CAMERA, 24 * 12).cam_from_object[:24])
+    found = mend_by_tracks(AROUND, shared(still, 4000), 640)
+    assert (found.verdict, found.posed is AROUND) == ("no fit", True)
+
+
 def test_too_little_shared_keeps_the_cameras() -> None:
     few = TRACKS.chosen(np.arange(TRACKS.count) < 40)
     found = mend_by_tracks(AROUND, few, 640)

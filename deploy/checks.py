@@ -156,6 +156,11 @@ def field(path: Path) -> Iterator[Finding]:
         from fieldpose.deploy.evaluation.accuracy import in_words
 
         yield Finding("field", "ok", in_words(about.accuracy))
+    if about.camera_fit is not None:
+        from fieldpose.deploy.cameras import in_words as fit_in_words
+
+        fits = about.camera_fit.verdict in ("fit", "adjusted")
+        yield Finding("field", "ok" if fits else "note", fit_in_words(about.camera_fit, about.unit))
     if found.descriptors is None:
         told = "it does not remember how its training views look: searches take longer, and estimate needs a guess"
         yield Finding("field", "note", told, "train it again")

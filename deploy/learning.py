@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from fieldpose.deploy.cameras import Cameras, fit_cameras, in_words, kept_in_words
 from fieldpose.deploy.settings import Settings
 from fieldpose.errors import WeightsError
 from fieldpose.stages.matching.core import MatchingConfig
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
+from fieldpose.stages.nerf.datasets import Dataset
 from fieldpose.stages.nerf.datasets.assemble import Holdout
 from fieldpose.stages.nerf.field import Field
-from fieldpose.stages.nerf.from_dataset import TrainedField, TrainingReport, train_field
+from fieldpose.stages.nerf.from_dataset import FittedCameras, TrainedField, TrainingReport, train_field
 from fieldpose.stages.nerf.metadata import DESCRIBED_SIZE, PoseAccuracy
 
 Say = Callable[[str], None]
@@ -30,11 +32,15 @@ def learn_field(
     matching: MatchingConfig | None = None,
     report: Callable[[TrainingReport], None] = lambda state: None,
     say: Say = lambda text: None,
+    cameras: Cameras = "auto",
+    note: Say = lambda text: None,
+    looked: Callable[[str, float], None] = lambda what, share: None,
 ) -> TrainedField:
     """Learn, save, describe and examine a field; see train_field.
 
     say: is told in a line where weights are missing, without which the field remembers nothing, or is not examined, and
-    what of the dataset a user should know.
+    what of the dataset a user should know. cameras: whether those that do not fit their images are adjusted. note: is
+    told that they fit, or how they were adjusted. looked: is told what is done before the training, and its share.
     Raises DatasetError, ConfigError.
     """
     matching = matching or MatchingConfig()
@@ -43,7 +49,20 @@ def learn_field(
         lambda images: _described(images, matching, say),
         lambda field, images: _examined(field, images, matching, training, say),
         say,
+        lambda found: None if cameras == "given" else _fitted(found, holdout, training.threads, say, note, looked),
     )  # fmt: skip
+
+
+def _fitted(
+    dataset: Dataset, holdout: Holdout | None, threads: int, say: Say, note: Say, looked: Callable[[str, float], None]
+) -> FittedCameras:  # fmt: skip
+    fitted = fit_cameras(dataset, holdout, threads, looked)
+    in_order = fitted.fit.verdict in ("fit", "adjusted")
+    (note if in_order else say)(in_words(fitted.fit, dataset.unit))
+    kept = kept_in_words(fitted.fit)
+    if kept is not None:
+        say(kept)
+    return fitted
 
 
 def _described(images: Iterable[np.ndarray], matching: MatchingConfig, say: Say) -> np.ndarray | None:

@@ -30,6 +30,11 @@ CHECKED = (
     "fieldpose.stages.refinement.photometric",
     "fieldpose.stages.rendering.core",
     "fieldpose.stages.retrieval.core",
+    "fieldpose.stages.structure.adjustment",
+    "fieldpose.stages.structure.colmap",
+    "fieldpose.stages.structure.similarity",
+    "fieldpose.stages.structure.tracks",
+    "fieldpose.stages.structure.triangulation",
     "fieldpose.stages.tracking.policy",
 )
 

@@ -35,11 +35,13 @@ class Options:
     Example: fieldpose train ../shared/data/lego --size 400 --minutes 5 --out out/lego.safetensors
 
     The kind of dataset is recognised from its folder: Blender/NeRF-synthetic, transforms.json (instant-ngp,
-    nerfstudio) or LLFF. Ctrl-C ends the training early and keeps what was learnt. In the end some of the training
-    images are looked for in the field, which tells how exact poses are to be expected, and whether the dataset's own
-    are in order. The JSON file has: psnr_db (mean over the held-out views, null without any), psnr_db_by_view,
-    accuracy (images, found, rotation_deg and translation, medians, error_scale, how many times larger errors are than
-    an image shows; null where too few were found), steps, seconds, interrupted, size_bytes.
+    nerfstudio) or LLFF. First its cameras are compared with the images, and adjusted where they do not fit. Ctrl-C ends
+    the training early and keeps what was learnt. In the end some of the training images are looked for in the field,
+    which tells how exact poses are to be expected, and whether the dataset's own are in order. The JSON file has:
+    psnr_db (mean over the held-out views, null without any), psnr_db_by_view, accuracy (images, found, rotation_deg and
+    translation, medians, error_scale, how many times larger errors are than an image shows; null where too few were
+    found), cameras (verdict: fit, adjusted, too few or no fit; before_px, after_px, rotation_deg, translation,
+    focal_px, kept; null where they were taken as given), steps, seconds, interrupted, size_bytes.
     """
 
     dataset: tyro.conf.Positional[Path]
@@ -56,6 +58,10 @@ class Options:
     holdout: Literal["auto", "odd", "every8", "none"] = "auto"
     """Which images of a dataset without splits of its own are held out: auto is odd for transforms.json, every8 for
     LLFF."""
+    cameras: Literal["auto", "given"] = "auto"
+    """auto: where the images' own matches show that poses, focal length or distortion are off by more than is seen,
+    they are adjusted before the training, in the dataset's frame and unit; else they are kept as they are. given: they
+    are taken as they are, without looking."""
     turntable: str | None = None
     """Write a video (.mp4) of what was learnt, three seconds around the object or along training views, into this file;
     by default beside the field, under its name. none: write none."""
@@ -77,10 +83,11 @@ class Options:
         training = overridden(self.training, minutes=self.minutes, backend=self.backend)
         holdout = None if self.holdout == "none" else self.holdout
         began = time.monotonic()
-        with _progress_bar() as report:
+        with _progress_bar() as (report, looked):
             trained = learn_field(
-                self.dataset, self.out, self.size, holdout, training, self.model, self.matching, report, _say
-            )
+                self.dataset, self.out, self.size, holdout, training, self.model, self.matching, report, _say,
+                self.cameras, _say, looked,
+            )  # fmt: skip
         figures = _figures(trained, self.out)
         write_json(self.json, figures)
         print(f"{self.out}: {_quality(trained)}; {figures['size_bytes'] / 1e6:.1f} MB, ", end="")
@@ -117,6 +124,7 @@ def _figures(trained: TrainedField, out: Path) -> dict[str, Any]:
         "psnr_db": float(np.mean(scores)) if scores else None,
         "psnr_db_by_view": scores,
         "accuracy": msgspec.to_builtins(trained.field.metadata.accuracy),
+        "cameras": msgspec.to_builtins(trained.field.metadata.camera_fit),
         "steps": trained.field.metadata.trained_steps,
         "seconds": trained.field.metadata.trained_seconds,
         "interrupted": trained.interrupted,
@@ -132,23 +140,30 @@ def _quality(trained: TrainedField) -> str:
 
 
 @contextmanager
-def _progress_bar() -> Iterator[Callable[[TrainingReport], None]]:
-    """Gives a function that shows a training's progress on stderr, as lines where that is no terminal."""
+def _progress_bar() -> Iterator[tuple[Callable[[TrainingReport], None], Callable[[str, float], None]]]:
+    """Gives functions that show on stderr, as lines where that is no terminal, a training and what comes before it."""
     console = progress_console()
-    columns = (TextColumn("training"), BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
+    columns = (TextColumn("{task.fields[doing]}"), BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("reading the images", total=1.0)
-        next_line = 0.0
+        task = bar.add_task("reading the images", total=1.0, doing="training")
+        next_line, last = 0.0, ""
+
+        def looked(what: str, share: float) -> None:
+            nonlocal last
+            bar.update(task, completed=share, description=what, doing="cameras")
+            if not console.is_terminal and what != last:
+                console.print(f"cameras: {what}", highlight=False)
+            last = what
 
         def report(state: TrainingReport) -> None:
             nonlocal next_line
             text = _step_in_words(state)
-            bar.update(task, completed=state.progress.fraction, description=text)
+            bar.update(task, completed=state.progress.fraction, description=text, doing="training")
             if not console.is_terminal and state.progress.seconds >= next_line:
                 next_line = state.progress.seconds + _LINE_EVERY_S
                 console.print(f"training: {state.progress.fraction:.0%}, {text}", highlight=False)
 
-        yield report
+        yield report, looked
 
 
 def _step_in_words(state: TrainingReport) -> str:

@@ -15,10 +15,10 @@ import numpy as np
 from fieldpose.stages.nerf.backend import resolved
 from fieldpose.stages.nerf.blocks import View
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
-from fieldpose.stages.nerf.datasets import Dataset, load_dataset
+from fieldpose.stages.nerf.datasets import Dataset, PosedCamera, load_dataset
 from fieldpose.stages.nerf.datasets.images import over_background
 from fieldpose.stages.nerf.field import Field
-from fieldpose.stages.nerf.metadata import FieldMetadata, PoseAccuracy, Space, TrainingCamera
+from fieldpose.stages.nerf.metadata import CameraFit, FieldMetadata, PoseAccuracy, Space, TrainingCamera
 from fieldpose.stages.nerf.occupancy import finer
 from fieldpose.stages.nerf.renderer import NumbaRenderer
 from fieldpose.stages.nerf.training import Learner, Progress, Trainer, evaluate
@@ -46,6 +46,14 @@ class TrainingReport:
 
     progress: Progress
     validation_psnr_db: float | None
+
+
+@dataclass(frozen=True)
+class FittedCameras:
+    """What became of a dataset's cameras; `cameras` of all its images, or None where they stay as given."""
+
+    fit: CameraFit
+    cameras: Sequence[PosedCamera] | None
 
 
 @dataclass(frozen=True)
@@ -125,6 +133,7 @@ def train_field(
     remember: Callable[[Iterable[np.ndarray]], np.ndarray | None] = lambda images: None,
     examine: Callable[[Field, Sequence[np.ndarray]], PoseAccuracy | None] = lambda field, images: None,
     say: Callable[[str], None] = lambda text: None,
+    fit: Callable[[Dataset], FittedCameras | None] = lambda dataset: None,
 ) -> TrainedField:
     """Train on a dataset's training images, measure on its held-out ones, and save; Ctrl-C ends the training early.
 
@@ -132,15 +141,21 @@ def train_field(
     examine: finds out how well these are found in the field, or None if that cannot be; not where the training was
     ended early.
     say: is told, a line each, what of the dataset a user should know.
+    fit: is given the training images, finds out whether the dataset's cameras fit, and cameras of both splits that do
+    where they do not.
     Raises DatasetError; nothing is written before the training is over.
     """
     training, config = training or TrainingConfig(), config or FieldConfig()
     dataset = load_dataset(path, "train", size, holdout=holdout)
     for note in dataset.notes:
         say(note)
+    fitted = fit(dataset)
+    cameras = None if fitted is None else fitted.cameras
+    if cameras is not None:
+        dataset = load_dataset(path, "train", size, holdout=holdout, cameras=cameras)
     views = views_of(dataset)
-    held_out = held_out_views(path, size, holdout)
-    metadata = metadata_of(dataset, views, config)
+    held_out = held_out_views(path, size, holdout, cameras)
+    metadata = replace_metadata(metadata_of(dataset, views, config), camera_fit=None if fitted is None else fitted.fit)
     trainer = make_learner(views, metadata.space, config, training)
     monitor = _Monitor(trainer, metadata, held_out[: training.validation_views], report)
     start = time.monotonic()
@@ -207,11 +222,13 @@ def replace_metadata(metadata: FieldMetadata, **changes: object) -> FieldMetadat
     return msgspec.structs.replace(metadata, **changes)
 
 
-def held_out_views(path: Path, size: int | None, holdout: Holdout | None) -> list[View]:
-    """The held-out images of a dataset, loaded; none where nothing is held out."""
+def held_out_views(
+    path: Path, size: int | None, holdout: Holdout | None, cameras: Sequence[PosedCamera] | None = None
+) -> list[View]:
+    """The held-out images of a dataset, loaded; none where nothing is held out. cameras: see load_dataset."""
     if holdout is None:
         return []
-    both = load_dataset(path, "all", size, holdout=holdout)
+    both = load_dataset(path, "all", size, holdout=holdout, cameras=cameras)
     test = tuple(record for record in both.images if record.split == "test")
     return views_of(replace(both, images=test)) if test else []
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import msgspec
 import numpy as np
 
@@ -67,6 +69,26 @@ class PoseAccuracy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     error_scale: float
 
 
+class CameraFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How the dataset's cameras fitted their images before the training, and how far they were moved to fit.
+
+    verdict: "fit", they were kept; "adjusted"; "too few" images share enough, or "no fit" was found, and they were
+    kept. before_px and after_px: median distance of points from where they are seen, by the given cameras and by
+    adjusted ones, in images whose longer side has size_px. rotation_deg and translation (object units): median and most
+    of what the poses were changed by. focal_px: in the median of the images, at the size of their files, before and
+    after. kept: images that share too little with others, whose cameras stayed.
+    """
+
+    verdict: Literal["fit", "adjusted", "too few", "no fit"]
+    size_px: int
+    focal_px: tuple[float, float]
+    before_px: float | None = None
+    after_px: float | None = None
+    rotation_deg: tuple[float, float] | None = None
+    translation: tuple[float, float] | None = None
+    kept: tuple[str, ...] = ()
+
+
 class FieldMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Stored as JSON beside the arrays of a field."""
 
@@ -81,6 +103,7 @@ class FieldMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     has_background: bool = True
     psnr_db: float | None = None
     accuracy: PoseAccuracy | None = None
+    camera_fit: CameraFit | None = None
     trained_seconds: float = 0.0
     trained_steps: int = 0
     made_by: str = ""

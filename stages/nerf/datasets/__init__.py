@@ -3,6 +3,6 @@
 from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets.bounds import SceneBounds
 from fieldpose.stages.nerf.datasets.loader import load_dataset
-from fieldpose.stages.nerf.datasets.records import Dataset, ImageRecord, find_name
+from fieldpose.stages.nerf.datasets.records import Dataset, ImageRecord, PosedCamera, find_name
 
-__all__ = ["Dataset", "DatasetError", "ImageRecord", "SceneBounds", "find_name", "load_dataset"]
+__all__ = ["Dataset", "DatasetError", "ImageRecord", "PosedCamera", "SceneBounds", "find_name", "load_dataset"]

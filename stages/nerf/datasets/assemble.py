@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -12,7 +13,7 @@ import numpy as np
 from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets import images
 from fieldpose.stages.nerf.datasets.bounds import SceneBounds, box_bounds, object_bounds, unbounded_bounds
-from fieldpose.stages.nerf.datasets.records import Dataset, ImageRecord, Kind, Scene
+from fieldpose.stages.nerf.datasets.records import Dataset, ImageRecord, Kind, PosedCamera, Scene
 
 Holdout = Literal["auto", "odd", "every8"]
 Split = Literal["train", "test", "all"]
@@ -37,6 +38,15 @@ def split_of(index: int, holdout: Holdout | None) -> Literal["train", "test"]:
     """The split of the image at `index` in the sorted order; None holds nothing out."""
     held_out = index % 2 == 1 if holdout == "odd" else holdout == "every8" and index % 8 == 0
     return "test" if held_out else "train"
+
+
+def with_cameras(draft: Draft, cameras: Sequence[PosedCamera]) -> Draft:
+    """With these cameras instead of its own, one an image, in the order of its records."""
+    records = [
+        replace(record, camera=given.camera.resized(*_size(record)), cam_from_object=given.cam_from_object)
+        for record, given in zip(draft.records, cameras, strict=True)
+    ]
+    return replace(draft, records=records)
 
 
 def assemble(root: Path, draft: Draft, split: Split) -> Dataset:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets import blender, llff, transforms
-from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, Split, assemble
-from fieldpose.stages.nerf.datasets.records import Dataset
+from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, Split, assemble, with_cameras
+from fieldpose.stages.nerf.datasets.records import Dataset, PosedCamera
 
 
 def load_dataset(
@@ -18,18 +19,21 @@ def load_dataset(
     *,
     holdout: Holdout | None = "auto",
     llff_normalise: bool = True,
+    cameras: Sequence[PosedCamera] | None = None,
 ) -> Dataset:
     """Read a dataset's poses and cameras, and make sure that its files are there; pixels are read later.
 
     split: "all" keeps both, each image says which it is in. size: the longer side in pixels to shrink images to.
     downscale: shrink by this factor instead; LLFF takes the folder of that factor. holdout, for kinds without
     splits of their own: "odd" or "every8" images (sorted by name) are test, None holds nothing out, "auto" is "odd"
-    for transforms.json and "every8" for LLFF. llff_normalise: see llff.read_llff.
+    for transforms.json and "every8" for LLFF. llff_normalise: see llff.read_llff. cameras: of all images, both splits,
+    in their order, instead of those that the files tell.
     Raises DatasetError, one line that names the file and says how to mend it.
     """
     root = Path(path)
     _check_options(root, size, downscale)
-    dataset = assemble(root, _read(root, holdout, llff_normalise, downscale, size), split)
+    draft = _read(root, holdout, llff_normalise, downscale, size)
+    dataset = assemble(root, draft if cameras is None else with_cameras(draft, cameras), split)
     if size is not None:
         return dataset.resized(size)
     if downscale is not None and dataset.kind != "llff":

@@ -42,6 +42,14 @@ class ImageRecord:
 
 
 @dataclass(frozen=True, eq=False)
+class PosedCamera:
+    """A camera, for any size of its images, and its cam_from_object (4, 4)."""
+
+    camera: Camera
+    cam_from_object: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class Dataset:
     """Posed photographs of one scene; methods may be called from several threads at once.
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from fieldpose.stages.nerf.blas import SingleThreadedBlas
 from fieldpose.stages.nerf.config import FieldConfig
-from fieldpose.stages.nerf.kernels.encoding import LANES
+from fieldpose.stages.nerf.kernels.plan import LANES
 from fieldpose.stages.nerf.kernels.types import SH_SIZE, Rays, Samples
 from fieldpose.stages.nerf.kernels.vectors import BLOCK
 

@@ -15,9 +15,9 @@ WIDTH = 4
 BLOCK = 64
 """Samples that a plan is made for at once; see `encoding.plan`."""
 
-_F32, _I32, _I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
-_V4 = ir.VectorType(_F32, WIDTH)
-_FLAGS = ("contract",)
+F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
+CONTRACT = ("contract",)
+_V4 = ir.VectorType(F32, WIDTH)
 
 
 def reads_half_floats() -> bool:
@@ -25,42 +25,32 @@ def reads_half_floats() -> bool:
     return binding.get_host_cpu_features().get("f16c", True)
 
 
-def _data(context: Any, builder: ir.IRBuilder, kind: types.Array, array: ir.Value) -> ir.Value:
+def data_of(context: Any, builder: ir.IRBuilder, kind: types.Array, array: ir.Value) -> ir.Value:
+    """Pointer to an array's first element."""
     return context.make_array(kind)(context, builder, array).data
+
+
+def vector_at(builder: ir.IRBuilder, data: ir.Value, at: ir.Value, kind: ir.VectorType) -> ir.Value:
+    """Pointer to the elements from data[at] on, as a vector of this kind."""
+    return builder.bitcast(builder.gep(data, [at]), kind.as_pointer())
 
 
 def _row(builder: ir.IRBuilder, kind: types.Array, data: ir.Value, row: ir.Value) -> ir.Value:
     """Row `row` of a table (n, 4) as four float32."""
     half = kind.dtype == types.uint16
-    element = ir.VectorType(ir.HalfType() if half else _F32, WIDTH)
-    loaded = builder.load(builder.gep(builder.bitcast(data, element.as_pointer()), [row]))
-    loaded.align = 2 if half else 4
+    element = ir.VectorType(ir.HalfType() if half else F32, WIDTH)
+    loaded = builder.load(builder.gep(builder.bitcast(data, element.as_pointer()), [row]), align=2 if half else 4)
     return builder.fpext(loaded, _V4) if half else loaded
-
-
-def _four(builder: ir.IRBuilder, data: ir.Value, at: ir.Value) -> ir.Value:
-    """Pointer to four float32 from data[at] on."""
-    return builder.bitcast(builder.gep(data, [at]), _V4.as_pointer())
-
-
-def _load(builder: ir.IRBuilder, pointer: ir.Value) -> ir.Value:
-    value = builder.load(pointer)
-    value.align = 4
-    return value
-
-
-def _store(builder: ir.IRBuilder, value: ir.Value, pointer: ir.Value) -> None:
-    builder.store(value, pointer).align = 4
 
 
 def _planned(builder: ir.IRBuilder, rows: ir.Value, weights: ir.Value, s: ir.Value, corner: int) -> tuple[Any, Any]:
     """Table row and weight (in all four lanes) of a corner of sample s of the block."""
-    at = builder.add(s, ir.Constant(_I64, BLOCK * corner))
-    row = builder.zext(builder.load(builder.gep(rows, [at])), _I64)
+    at = builder.add(s, ir.Constant(I64, BLOCK * corner))
+    row = builder.zext(builder.load(builder.gep(rows, [at])), I64)
     lane = builder.insert_element(
-        ir.Constant(_V4, ir.Undefined), builder.load(builder.gep(weights, [at])), ir.Constant(_I32, 0)
+        ir.Constant(_V4, ir.Undefined), builder.load(builder.gep(weights, [at])), ir.Constant(I32, 0)
     )
-    none = ir.Constant(ir.VectorType(_I32, WIDTH), [0] * WIDTH)
+    none = ir.Constant(ir.VectorType(I32, WIDTH), [0] * WIDTH)
     return row, builder.shuffle_vector(lane, ir.Constant(_V4, ir.Undefined), none)
 
 
@@ -69,13 +59,13 @@ def blend4(typing_context, table, rows, weights, s, x, at):  # type: ignore[no-u
     """x[at:at + 4] (x flat) = sum over the eight corners c of weights[c, s] * table[rows[c, s]]."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        data = [_data(context, builder, signature.args[i], arguments[i]) for i in (0, 1, 2, 4)]
+        data = [data_of(context, builder, signature.args[i], arguments[i]) for i in (0, 1, 2, 4)]
         total = None
         for corner in range(8):
             row, weight = _planned(builder, data[1], data[2], arguments[3], corner)
-            part = builder.fmul(weight, _row(builder, signature.args[0], data[0], row), flags=_FLAGS)
-            total = part if total is None else builder.fadd(part, total, flags=_FLAGS)
-        _store(builder, total, _four(builder, data[3], arguments[5]))
+            part = builder.fmul(weight, _row(builder, signature.args[0], data[0], row), flags=CONTRACT)
+            total = part if total is None else builder.fadd(part, total, flags=CONTRACT)
+        builder.store(total, vector_at(builder, data[3], arguments[5], _V4), align=4)
         return context.get_dummy_value()
 
     return types.void(table, rows, weights, s, x, at), generate
@@ -86,14 +76,14 @@ def spread4(typing_context, dtable, rows, weights, s, dx, at):  # type: ignore[n
     """dtable[rows[c, s]] += weights[c, s] * dx[at:at + 4] (dx flat), for the eight corners c."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        data = [_data(context, builder, signature.args[i], arguments[i]) for i in (0, 1, 2, 4)]
-        gradient = _load(builder, _four(builder, data[3], arguments[5]))
+        data = [data_of(context, builder, signature.args[i], arguments[i]) for i in (0, 1, 2, 4)]
+        gradient = builder.load(vector_at(builder, data[3], arguments[5], _V4), align=4)
         table = builder.bitcast(data[0], _V4.as_pointer())
         for corner in range(8):
             row, weight = _planned(builder, data[1], data[2], arguments[3], corner)
             pointer = builder.gep(table, [row])
-            part = builder.fmul(weight, gradient, flags=_FLAGS)
-            _store(builder, builder.fadd(part, _load(builder, pointer), flags=_FLAGS), pointer)
+            part = builder.fmul(weight, gradient, flags=CONTRACT)
+            builder.store(builder.fadd(part, builder.load(pointer, align=4), flags=CONTRACT), pointer, align=4)
         return context.get_dummy_value()
 
     return types.void(dtable, rows, weights, s, dx, at), generate
@@ -104,10 +94,11 @@ def dot4(typing_context, table, row, dx, at):  # type: ignore[no-untyped-def]
     """Scalar product of table[row] and dx[at:at + 4] (dx flat)."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        left = _row(builder, table, _data(context, builder, signature.args[0], arguments[0]), arguments[1])
-        right = _load(builder, _four(builder, _data(context, builder, signature.args[2], arguments[2]), arguments[3]))
-        product = builder.fmul(left, right, flags=_FLAGS)
-        lanes = [builder.extract_element(product, ir.Constant(_I32, i)) for i in range(WIDTH)]
+        left = _row(builder, table, data_of(context, builder, signature.args[0], arguments[0]), arguments[1])
+        data = data_of(context, builder, signature.args[2], arguments[2])
+        right = builder.load(vector_at(builder, data, arguments[3], _V4), align=4)
+        product = builder.fmul(left, right, flags=CONTRACT)
+        lanes = [builder.extract_element(product, ir.Constant(I32, i)) for i in range(WIDTH)]
         return builder.fadd(builder.fadd(lanes[0], lanes[1]), builder.fadd(lanes[2], lanes[3]))
 
     return types.float32(table, row, dx, at), generate
@@ -118,6 +109,6 @@ def float_of_bits(typing_context, bits):  # type: ignore[no-untyped-def]
     """The float32 with these bits (int32)."""
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        return builder.bitcast(arguments[0], _F32)
+        return builder.bitcast(arguments[0], F32)
 
     return types.float32(types.int32), generate

@@ -9,6 +9,7 @@ from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
 from fieldpose.stages.nerf.kernels.encoding import encode
+from fieldpose.stages.nerf.kernels.layers import layer
 from fieldpose.stages.nerf.kernels.march import advance, begin
 from fieldpose.stages.nerf.kernels.types import SH_SIZE, Domain, Net, Rays, Samples
 from fieldpose.stages.nerf.kernels.vectors import float_of_bits
@@ -19,23 +20,15 @@ HALF = np.float32(0.5)
 LOG2_E = np.float32(1.4426950408889634)
 LN2_HIGH, LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
 SMALLEST = np.float32(1e-9)
-
-
-@njit(nogil=True, fastmath=FASTMATH)
-def relu(a: np.ndarray) -> None:
-    for i in range(a.shape[0]):
-        for j in range(a.shape[1]):
-            a[i, j] = max(a[i, j], np.float32(0))
+NONE, LEAST = np.float32(0), np.float32(-np.inf)
 
 
 @njit(nogil=True, fastmath=FASTMATH)
 def density_network(net: Net, samples: Samples, first: int, last: int) -> None:
     """Fill x, h and out of rows first..last."""
     encode(net, samples, first, last)
-    h = samples.h[first:last]
-    np.dot(samples.x[first:last], net.w1, h)
-    relu(h)
-    np.dot(h, net.w2, samples.out[first:last])
+    layer(samples.x, net.w1, NONE, first, last, samples.h)
+    layer(samples.h, net.w2, LEAST, first, last, samples.out)
 
 
 @njit(inline="always")
@@ -112,12 +105,10 @@ def colour_network(net: Net, directions: np.ndarray, first: int, count: int, ray
     features = rays.feats.shape[1] - SH_SIZE
     for r in range(count):
         harmonics(directions[first + r], rays.feats[r], features)
-    h1, h2 = rays.h1[:count], rays.h2[:count]
-    np.dot(rays.feats[:count], net.c1, h1)
-    relu(h1)
-    np.dot(h1, net.c2, h2)
-    relu(h2)
-    np.dot(h2, net.c3, rays.rgb[:count])
+    zero = np.int64(0)
+    layer(rays.feats, net.c1, NONE, zero, count, rays.h1)
+    layer(rays.h1, net.c2, NONE, zero, count, rays.h2)
+    layer(rays.h2, net.c3, LEAST, zero, count, rays.rgb)
 
 
 @njit(inline="always")

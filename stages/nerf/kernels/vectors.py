@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numba
 from llvmlite import binding, ir
 from numba import types
 from numba.extending import intrinsic
@@ -18,6 +19,13 @@ BLOCK = 64
 F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
 CONTRACT = ("contract",)
 _V4 = ir.VectorType(F32, WIDTH)
+
+
+def supports(feature: str) -> bool:
+    """Whether kernels are compiled for a processor with this feature, by LLVM's name."""
+    if numba.config.CPU_FEATURES is not None:
+        return f"+{feature}" in numba.config.CPU_FEATURES.split(",")
+    return bool(binding.get_host_cpu_features().get(feature, False))
 
 
 def reads_half_floats() -> bool:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.types import BLOCK, Domain
 
 
@@ -29,7 +29,7 @@ def to_cube(contracted: bool, y0: float, y1: float, y2: float) -> tuple[float, f
     return y0 * scale + half, y1 * scale + half, y2 * scale + half, max(r, np.float32(1))
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def cube_gradient(contracted: bool, y: np.ndarray, du: np.ndarray, dy: np.ndarray) -> None:
     """Pull the gradient du (3,) with respect to the cube back to normalised coordinates, into dy (3,)."""
     if not contracted:
@@ -81,20 +81,3 @@ def clip(dom: Domain, o: np.ndarray, d: np.ndarray) -> tuple[float, float]:
                 near = max(near, min(t0, t1))
                 far = min(far, max(t0, t1))
     return near, far
-
-
-@njit(inline="always")
-def leave(u: float, inverse: float, n: float, reach: float) -> float:
-    """Distance along the ray at which a coordinate leaves its cell (of n along the axis) and `reach` cells around it.
-
-    `inverse` is 1 / direction, infinite where the ray does not move along the axis; uncontracted space.
-    """
-    index = np.floor(u * n)
-    border = (index + np.float32(1) + reach if inverse > 0 else index - reach) / n
-    return (border - u) * np.float32(2) * inverse
-
-
-@njit(inline="always")
-def skip(n: float, reach: float, u0: float, u1: float, u2: float, i0: float, i1: float, i2: float) -> float:
-    """Distance along the ray to the border of the position's cell and `reach` cells around it."""
-    return max(min(leave(u0, i0, n, reach), leave(u1, i1, n, reach), leave(u2, i2, n, reach)), np.float32(0))

@@ -62,11 +62,13 @@ class Samples(NamedTuple):
 class Rays(NamedTuple):
     """State of the rays of a packet."""
 
+    lines: np.ndarray  # (9, r) origin, unit direction, and 1 / direction in blocks of the occupancy grid
     t: np.ndarray
     far: np.ndarray
     trans: np.ndarray
     last: np.ndarray  # row of the ray's newest sample, -1 without
     alive: np.ndarray
+    sums: np.ndarray  # (r, 1 + features) weighted sums of the samples' outputs
     feats: np.ndarray  # (r, features + SH_SIZE) composited features, then the direction's harmonics
     opacity: np.ndarray
     depth: np.ndarray  # weighted mean of the samples' distances, not divided by the opacity

@@ -69,10 +69,11 @@ def _round(
     error = float(np.median(found.error_px))
     fitting = tracks.without(found.error_px > max(_WRONG * error, _LEAST_WRONG_PX))
     placed = triangulate(now, fitting)
-    wide = placed.angle_rad > _LEAST_ANGLE
+    behind = np.bincount(fitting.track, ~np.isfinite(placed.error_px), fitting.count) > 0
+    good = (placed.angle_rad > _LEAST_ANGLE) & ~behind
     noise_px = error / MEDIAN_LENGTH
     priors = _priors(now, anchors) if near and freedom != "focal alone" else None
-    adjusted = bundle_adjust(now, placed.points[wide], fitting.chosen(wide), freedom, noise_px, priors)
+    adjusted = bundle_adjust(now, placed.points[good], fitting.chosen(good), freedom, noise_px, priors)
     if freedom == "focal alone":
         return adjusted
     similarity = align(adjusted.cam_from_object, anchors.cam_from_object)

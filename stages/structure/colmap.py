@@ -56,8 +56,8 @@ def bundle_adjust(
     """
     import pycolmap
 
-    # Of steps that fail, another is tried, which is nothing to tell.
-    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value
+    # Where steps fail others are tried, and what an adjustment is worth is seen by its result.
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     scene, shared = _scene(given, points, tracks, freedom)
     options, config = _options(freedom, noise_px), pycolmap.BundleAdjustmentConfig()
     for image_id in scene.images:

@@ -15,19 +15,20 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 
 from fieldpose.stages.fastmath import FASTMATH
-from fieldpose.stages.nerf.kernels.vectors import CONTRACT, F32, I32, I64, data_of, supports, vector_at
+from fieldpose.stages.nerf.kernels.vectors import (
+    COLUMNS,
+    CONTRACT,
+    F32,
+    I64,
+    in_all_lanes,
+    supports,
+    vector_at,
+)
 
-COLUMNS = 16
 ROWS = 16 if supports("avx512f") else 6
 """Rows of a block: together with what they are multiplied with, they fill the registers."""
 
 _VECTOR = ir.VectorType(F32, COLUMNS)
-
-
-def _broadcast(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
-    lane = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), value, ir.Constant(I32, 0))
-    none = ir.Constant(ir.VectorType(I32, COLUMNS), [0] * COLUMNS)
-    return builder.shuffle_vector(lane, ir.Constant(_VECTOR, ir.Undefined), none)
 
 
 def _block(rows: int) -> Any:
@@ -49,10 +50,10 @@ def _block(rows: int) -> Any:
                 at = builder.add(builder.mul(loop.index, width), column)
                 weights = builder.load(vector_at(builder, arrays[1].data, at, _VECTOR), align=4)
                 for line, total in zip(lines, sums, strict=True):
-                    value = _broadcast(builder, builder.load(builder.gep(line, [loop.index])))
+                    value = in_all_lanes(builder, builder.load(builder.gep(line, [loop.index])), COLUMNS)
                     product = builder.fmul(value, weights, flags=CONTRACT)
                     builder.store(builder.fadd(builder.load(total), product, flags=CONTRACT), total)
-            least = _broadcast(builder, floor)
+            least = in_all_lanes(builder, floor, COLUMNS)
             for r, total in enumerate(sums):
                 value = builder.load(total)
                 value = builder.select(builder.fcmp_unordered(">", value, least), value, least)

@@ -8,8 +8,10 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
-from fieldpose.stages.nerf.kernels.space import clip, occupied, skip, to_cube
+from fieldpose.stages.nerf.kernels.ahead import AHEAD, occupied_ahead
+from fieldpose.stages.nerf.kernels.space import blocks_away, clip, occupied, skip, to_cube
 from fieldpose.stages.nerf.kernels.types import BLOCK, Domain, Rays, Samples
+from fieldpose.stages.nerf.kernels.vectors import lowest_bit
 
 TINY, HUGE = np.float32(1e-9), np.float32(1e9)
 
@@ -56,44 +58,66 @@ def advance(
     Samples of a ray lie on t0 + i * step whatever was skipped, so that every way to skip gives the same samples.
     """
     n, m = np.float32(dom.resolution), np.float32(dom.resolution // BLOCK)
-    step = np.float32(dom.step)
+    step, half, zero = np.float32(dom.step), np.float32(0.5), np.float32(0)
+    contracted, bits, distance = dom.contracted, dom.bits, dom.distance
     capacity = samples.t.shape[0]
     for r in range(count):
         if not rays.alive[r]:
             continue
         o0, o1, o2 = origins[first + r, 0], origins[first + r, 1], origins[first + r, 2]
         d0, d1, d2 = directions[first + r, 0], directions[first + r, 1], directions[first + r, 2]
-        i0, i1, i2 = inverse(d0), inverse(d1), inverse(d2)
-        t, far = rays.t[r], rays.far[r]
-        taken = 0
-        while taken < per_ray and t < far and row < capacity:
-            y0, y1, y2 = o0 + t * d0, o1 + t * d1, o2 + t * d2
-            u0, u1, u2, grow = to_cube(dom.contracted, y0, y1, y2)
-            dt = step * grow
-            empty = occupied(dom, u0, u1, u2)
-            if empty < 0:
-                samples.y[row, 0], samples.y[row, 1], samples.y[row, 2] = y0, y1, y2
-                samples.u[0, row], samples.u[1, row], samples.u[2, row] = u0, u1, u2
-                samples.t[row], samples.dt[row] = t, dt
-                samples.ray[row], samples.previous[row] = r, rays.last[r]
-                rays.last[r] = row
-                row += 1
-                taken += 1
-                t += dt
-            elif dom.contracted:
-                # Along a ray of unit speed no coordinate of the cube changes faster than by 1/4.
-                free = t + np.float32(empty - 1) * np.float32(4) / m
-                t += dt
-                while t < free and t < far:
-                    y0, y1, y2 = o0 + t * d0, o1 + t * d1, o2 + t * d2
-                    t += step * max(np.float32(1), np.float32(math.sqrt(y0 * y0 + y1 * y1 + y2 * y2)))
-            else:
-                if empty == 0:
-                    ahead = skip(n, np.float32(0), u0, u1, u2, i0, i1, i2)
-                else:
+        t, far, last = rays.t[r], rays.far[r], rays.last[r]
+        end = min(row + per_ray, capacity)
+        if not contracted:
+            i0, i1, i2 = inverse(d0) / m, inverse(d1) / m, inverse(d2) / m
+            h0, h1, h2 = half * step * d0, half * step * d1, half * step * d2
+            while row < end and t < far:
+                u0, u1, u2, _ = to_cube(False, o0 + t * d0, o1 + t * d1, o2 + t * d2)
+                empty = blocks_away(distance, m, u0, u1, u2)
+                if empty > 0:
                     ahead = skip(m, np.float32(empty - 1), u0, u1, u2, i0, i1, i2)
-                t += dt * max(np.float32(1), np.ceil(ahead / dt))
-        rays.t[r] = t
-        if t >= far or taken < per_ray:
+                    t += step * max(np.float32(1), np.ceil(ahead / step))
+                    continue
+                found = occupied_ahead(bits, n, u0, u1, u2, h0, h1, h2)
+                begun, t = t, t + step * np.float32(AHEAD)
+                while found != 0:
+                    t_sample = begun + step * np.float32(lowest_bit(found))
+                    found &= found - 1
+                    if t_sample >= far:
+                        break
+                    y0, y1, y2 = o0 + t_sample * d0, o1 + t_sample * d1, o2 + t_sample * d2
+                    samples.y[row, 0], samples.y[row, 1], samples.y[row, 2] = y0, y1, y2
+                    u0, u1, u2, _ = to_cube(False, y0, y1, y2)
+                    samples.u[0, row], samples.u[1, row], samples.u[2, row] = u0, u1, u2
+                    samples.t[row], samples.dt[row] = t_sample, step
+                    samples.ray[row], samples.previous[row] = r, last
+                    last = row
+                    row += 1
+                    if row >= end:
+                        t = t_sample + step
+                        break
+        else:
+            while row < end and t < far:
+                y0, y1, y2 = o0 + t * d0, o1 + t * d1, o2 + t * d2
+                u0, u1, u2, grow = to_cube(True, y0, y1, y2)
+                dt = step * grow
+                empty = occupied(dom, u0, u1, u2)
+                if empty < 0:
+                    samples.y[row, 0], samples.y[row, 1], samples.y[row, 2] = y0, y1, y2
+                    samples.u[0, row], samples.u[1, row], samples.u[2, row] = u0, u1, u2
+                    samples.t[row], samples.dt[row] = t, dt
+                    samples.ray[row], samples.previous[row] = r, last
+                    last = row
+                    row += 1
+                    t += dt
+                else:
+                    # Along a ray of unit speed no coordinate of the cube changes faster than by 1/4.
+                    free = t + np.float32(empty - 1) * np.float32(4) / m
+                    t += dt
+                    while t < free and t < far:
+                        y0, y1, y2 = o0 + t * d0, o1 + t * d1, o2 + t * d2
+                        t += step * max(np.float32(1), np.float32(math.sqrt(y0 * y0 + y1 * y1 + y2 * y2)))
+        rays.t[r], rays.last[r] = t, last
+        if t >= far or row < end:
             rays.alive[r] = False
     return row

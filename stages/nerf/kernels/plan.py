@@ -11,18 +11,11 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from fieldpose.stages.nerf.kernels.vectors import BLOCK, CONTRACT, F32, I32, I64, data_of, vector_at
+from fieldpose.stages.nerf.kernels.vectors import BLOCK, CONTRACT, F32, I32, I64, data_of, in_all_lanes, vector_at
 
 LANES = 16
 PRIME_Y, PRIME_Z = 2654435761, 805459861
 _FLOATS, _INTS = ir.VectorType(F32, LANES), ir.VectorType(I32, LANES)
-
-
-def _all(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
-    """A scalar in all lanes."""
-    kind = ir.VectorType(value.type, LANES)
-    first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(I32, 0))
-    return builder.shuffle_vector(first, ir.Constant(kind, ir.Undefined), ir.Constant(_INTS, [0] * LANES))
 
 
 def _constant(number: int) -> ir.Constant:
@@ -34,7 +27,7 @@ def _cells(context: Any, builder: ir.IRBuilder, u: ir.Value, kind: types.Array, 
     array = context.make_array(kind)(context, builder, u)
     stride = builder.extract_value(array.shape, 1)
     one, none = ir.Constant(_FLOATS, [1.0] * LANES), ir.Constant(_FLOATS, [0.0] * LANES)
-    size = _all(builder, resolution)
+    size = in_all_lanes(builder, resolution, LANES)
     most = builder.fsub(size, one)
     for axis in range(3):
         place = builder.add(at, builder.mul(stride, ir.Constant(I64, axis)))
@@ -77,7 +70,7 @@ def plan_hashed(typing_context, u, at, resolution, mask, offset, rows, weights, 
         for (index, _, _), prime in zip(cells, (1, PRIME_Y, PRIME_Z), strict=True):
             low = builder.mul(index, _constant(prime))
             hashes.append((low, builder.add(low, _constant(prime))))
-        mask, offset = _all(builder, arguments[3]), _all(builder, arguments[4])
+        mask, offset = in_all_lanes(builder, arguments[3], LANES), in_all_lanes(builder, arguments[4], LANES)
         values = []
         for c in range(8):
             mixed = builder.xor(hashes[0][c & 1], builder.xor(hashes[1][c >> 1 & 1], hashes[2][c >> 2]))
@@ -99,15 +92,15 @@ def plan_dense(typing_context, u, at, resolution, side, offset, rows, weights, k
         cells = list(_cells(context, builder, arguments[0], kinds[0], arguments[1], arguments[2]))
         side = arguments[3]
         strides = (ir.Constant(I32, 1), side, builder.mul(side, side))
-        row = _all(builder, arguments[4])
+        row = in_all_lanes(builder, arguments[4], LANES)
         for (index, _, _), stride in zip(cells, strides, strict=True):
-            row = builder.add(row, builder.mul(index, _all(builder, stride)))
+            row = builder.add(row, builder.mul(index, in_all_lanes(builder, stride, LANES)))
         values = []
         for c in range(8):
             step = ir.Constant(I32, 0)
             for axis, stride in enumerate(strides):
                 step = builder.add(step, stride) if c >> axis & 1 else step
-            values.append(builder.add(row, _all(builder, step)))
+            values.append(builder.add(row, in_all_lanes(builder, step, LANES)))
         _store(builder, values, data_of(context, builder, kinds[5], arguments[5]), arguments[7])
         _store(builder, _weights(builder, cells), data_of(context, builder, kinds[6], arguments[6]), arguments[7])
         return context.get_dummy_value()

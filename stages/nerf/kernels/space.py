@@ -84,14 +84,27 @@ def clip(dom: Domain, o: np.ndarray, d: np.ndarray) -> tuple[float, float]:
 
 
 @njit(inline="always")
+def blocks_away(distance: np.ndarray, m: float, u0: float, u1: float, u2: float) -> int:
+    """How many blocks away the nearest block with an occupied cell is; m of them along each side."""
+    none, most = np.float32(0), m - np.float32(1)
+    ix, iy, iz = (
+        np.uint32(min(max(u0 * m, none), most)), np.uint32(min(max(u1 * m, none), most)),
+        np.uint32(min(max(u2 * m, none), most)),
+    )  # fmt: skip
+    side = np.uint32(m)
+    return distance[np.uint64(np.uint32(ix + np.uint32(side * np.uint32(iy + np.uint32(side * iz)))))]
+
+
+@njit(inline="always")
 def leave(u: float, inverse: float, n: float, reach: float) -> float:
     """Distance along the ray at which a coordinate leaves its cell (of n along the axis) and `reach` cells around it.
 
-    `inverse` is 1 / direction, infinite where the ray does not move along the axis; uncontracted space.
+    `inverse` is 1 / (n direction), large where the ray does not move along the axis; uncontracted space.
     """
-    index = np.floor(u * n)
-    border = (index + np.float32(1) + reach if inverse > 0 else index - reach) / n
-    return (border - u) * np.float32(2) * inverse
+    place = u * n
+    index = np.floor(place)
+    border = index + np.float32(1) + reach if inverse > 0 else index - reach
+    return (border - place) * np.float32(2) * inverse
 
 
 @njit(inline="always")

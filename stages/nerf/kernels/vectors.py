@@ -13,6 +13,8 @@ from numba import types
 from numba.extending import intrinsic
 
 WIDTH = 4
+COLUMNS = 16
+"""Of what layers of networks compute at once."""
 BLOCK = 64
 """Samples that a plan is made for at once; see `encoding.plan`."""
 
@@ -38,6 +40,15 @@ def data_of(context: Any, builder: ir.IRBuilder, kind: types.Array, array: ir.Va
     return context.make_array(kind)(context, builder, array).data
 
 
+def in_all_lanes(builder: ir.IRBuilder, value: ir.Value, lanes: int) -> ir.Value:
+    """A vector that has a scalar in every lane."""
+    kind = ir.VectorType(value.type, lanes)
+    first = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(I32, 0))
+    return builder.shuffle_vector(
+        first, ir.Constant(kind, ir.Undefined), ir.Constant(ir.VectorType(I32, lanes), [0] * lanes)
+    )
+
+
 def vector_at(builder: ir.IRBuilder, data: ir.Value, at: ir.Value, kind: ir.VectorType) -> ir.Value:
     """Pointer to the elements from data[at] on, as a vector of this kind."""
     return builder.bitcast(builder.gep(data, [at]), kind.as_pointer())
@@ -55,11 +66,7 @@ def _planned(builder: ir.IRBuilder, rows: ir.Value, weights: ir.Value, s: ir.Val
     """Table row and weight (in all four lanes) of a corner of sample s of the block."""
     at = builder.add(s, ir.Constant(I64, BLOCK * corner))
     row = builder.zext(builder.load(builder.gep(rows, [at])), I64)
-    lane = builder.insert_element(
-        ir.Constant(_V4, ir.Undefined), builder.load(builder.gep(weights, [at])), ir.Constant(I32, 0)
-    )
-    none = ir.Constant(ir.VectorType(I32, WIDTH), [0] * WIDTH)
-    return row, builder.shuffle_vector(lane, ir.Constant(_V4, ir.Undefined), none)
+    return row, in_all_lanes(builder, builder.load(builder.gep(weights, [at])), WIDTH)
 
 
 @intrinsic
@@ -120,3 +127,29 @@ def float_of_bits(typing_context, bits):  # type: ignore[no-untyped-def]
         return builder.bitcast(arguments[0], F32)
 
     return types.float32(types.int32), generate
+
+
+@intrinsic
+def add_row(typing_context, factor, source, at, target, to):  # type: ignore[no-untyped-def]
+    """target[to:to + COLUMNS] += factor * source[at:at + COLUMNS] (both flat)."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        kinds = signature.args
+        kind = ir.VectorType(F32, COLUMNS)
+        read = vector_at(builder, data_of(context, builder, kinds[1], arguments[1]), arguments[2], kind)
+        written = vector_at(builder, data_of(context, builder, kinds[3], arguments[3]), arguments[4], kind)
+        part = builder.fmul(in_all_lanes(builder, arguments[0], COLUMNS), builder.load(read, align=4), flags=CONTRACT)
+        builder.store(builder.fadd(part, builder.load(written, align=4), flags=CONTRACT), written, align=4)
+        return context.get_dummy_value()
+
+    return types.void(types.float32, source, types.int64, target, types.int64), generate
+
+
+@intrinsic
+def lowest_bit(typing_context, bits):  # type: ignore[no-untyped-def]
+    """Index of the lowest bit that is set in an int64 other than 0."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.int64(types.int64), generate

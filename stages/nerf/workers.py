@@ -61,6 +61,7 @@ def new_rays(config: FieldConfig, count: int) -> Rays:
         trans=array(count),
         last=np.zeros(count, np.int32),
         alive=np.zeros(count, np.bool_),
+        sums=array(count, 1 + config.features),
         feats=array(count, width),
         opacity=array(count),
         depth=array(count),

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.plan import LANES, plan_dense, plan_hashed
 from fieldpose.stages.nerf.kernels.types import Net, Samples
 from fieldpose.stages.nerf.kernels.vectors import BLOCK, WIDTH, blend4, dot4, spread4
@@ -43,7 +43,7 @@ def plan(
             plan_hashed(u, first + s, resolution, U32(mask), U32(offset), rows, weights, s)
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def encode(net: Net, samples: Samples, first: int, last: int) -> None:
     """Write the encoding of rows first..last of samples.u into samples.x."""
     table, x = net.table, samples.x.reshape(-1)
@@ -68,7 +68,7 @@ def encode(net: Net, samples: Samples, first: int, last: int) -> None:
                         x[U(at + s * inputs + f)] = total
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def scatter(net: Net, samples: Samples, first: int, last: int, dtable: np.ndarray) -> None:
     """Add the gradient of the encoding, samples.dx[first:last], to the table's gradient."""
     dx = samples.dx.reshape(-1)
@@ -103,7 +103,7 @@ def pull(table: np.ndarray, row: int, dx: np.ndarray, at: int) -> float:
     return total
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def position_gradients(net: Net, samples: Samples, first: int, last: int, du: np.ndarray) -> None:
     """Write into du (3, n) the gradients with respect to samples.u of the encoding whose gradient is samples.dx."""
     one = np.float32(1)

@@ -10,55 +10,47 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from fieldpose.stages.fastmath import FASTMATH
-from fieldpose.stages.nerf.kernels.vectors import (
-    COLUMNS,
-    CONTRACT,
-    F32,
-    I64,
-    in_all_lanes,
-    supports,
-    vector_at,
-)
+from fieldpose.stages.nerf.kernels.inner import inner
+from fieldpose.stages.nerf.kernels.vectors import COLUMNS, CONTRACT, F32, I64, in_all_lanes, supports, vector_at
 
 ROWS = 16 if supports("avx512f") else 6
 """Rows of a block: together with what they are multiplied with, they fill the registers."""
 
-_VECTOR = ir.VectorType(F32, COLUMNS)
 
-
-def _block(rows: int) -> Any:
-    """The intrinsic that computes a block of `rows` rows and COLUMNS columns."""
+def _block(rows: int, columns: int) -> Any:
+    """The intrinsic that computes a block of so many rows and columns."""
+    vector = ir.VectorType(F32, columns)
+    none = ir.Constant(vector, [0.0] * columns)
 
     @intrinsic
     def block(typing_context, x, w, out, row, column, floor):  # type: ignore[no-untyped-def]
-        """out[row:row + rows, column:column + COLUMNS] = max(x[row:row + rows] @ w[:, column:column + COLUMNS], floor)."""
+        """out[row:row + rows, column:column + columns] = max(x[row:row + rows] @ w[:, column:column + columns], floor)."""
 
         def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-            arrays = [context.make_array(kind)(context, builder, a) for kind, a in zip(signature.args[:3], arguments[:3])]
-            inner, width = (builder.extract_value(arrays[i].shape, 1) for i in (0, 1))
-            row, column, floor = arguments[3:]
-            lines = [builder.gep(arrays[0].data, [builder.mul(builder.add(row, ir.Constant(I64, r)), inner)]) for r in range(rows)]
-            sums = [cgutils.alloca_once_value(builder, ir.Constant(_VECTOR, [0.0] * COLUMNS)) for _ in range(rows)]
+            given = [context.make_array(signature.args[i])(context, builder, arguments[i]) for i in range(3)]
+            inner, width = (builder.extract_value(given[i].shape, 1) for i in (0, 1))
+            lines = [builder.add(arguments[3], ir.Constant(I64, r)) for r in range(rows)]
+            reads = [builder.gep(given[0].data, [builder.mul(line, inner)]) for line in lines]
+            sums = [cgutils.alloca_once(builder, vector) for _ in range(rows)]
             for total in sums:
-                builder.store(ir.Constant(_VECTOR, [0.0] * COLUMNS), total)
+                builder.store(none, total)
             with cgutils.for_range(builder, inner) as loop:
-                at = builder.add(builder.mul(loop.index, width), column)
-                weights = builder.load(vector_at(builder, arrays[1].data, at, _VECTOR), align=4)
-                for line, total in zip(lines, sums, strict=True):
-                    value = in_all_lanes(builder, builder.load(builder.gep(line, [loop.index])), COLUMNS)
+                at = builder.add(builder.mul(loop.index, width), arguments[4])
+                weights = builder.load(vector_at(builder, given[1].data, at, vector), align=4)
+                for read, total in zip(reads, sums, strict=True):
+                    value = in_all_lanes(builder, builder.load(builder.gep(read, [loop.index])), columns)
                     product = builder.fmul(value, weights, flags=CONTRACT)
                     builder.store(builder.fadd(builder.load(total), product, flags=CONTRACT), total)
-            least = in_all_lanes(builder, floor, COLUMNS)
-            for r, total in enumerate(sums):
+            least = in_all_lanes(builder, arguments[5], columns)
+            for line, total in zip(lines, sums, strict=True):
                 value = builder.load(total)
                 value = builder.select(builder.fcmp_unordered(">", value, least), value, least)
-                at = builder.add(builder.mul(builder.add(row, ir.Constant(I64, r)), width), column)
-                builder.store(value, vector_at(builder, arrays[2].data, at, _VECTOR), align=4)
+                at = builder.add(builder.mul(line, width), arguments[4])
+                builder.store(value, vector_at(builder, given[2].data, at, vector), align=4)
             return context.get_dummy_value()
 
         return types.void(x, w, out, types.int64, types.int64, types.float32), generate
@@ -66,25 +58,38 @@ def _block(rows: int) -> Any:
     return block
 
 
-_rows, _row = _block(ROWS), _block(1)
+def _strip(columns: int) -> Any:
+    """What computes so many columns of rows first..last."""
+    block, line = _block(ROWS, columns), _block(1, columns)
 
-
-@njit(nogil=True, fastmath=FASTMATH)
-def layer(x: np.ndarray, w: np.ndarray, floor: float, first: int, last: int, out: np.ndarray) -> None:
-    """out[first:last] = max(x[first:last] @ w, floor); a row does not depend on which others there are."""
-    if w.shape[1] % COLUMNS != 0:
-        np.dot(x[first:last], w, out[first:last])
-        for r in range(first, last):
-            for c in range(w.shape[1]):
-                out[r, c] = max(out[r, c], floor)
-        return
-    for column in range(0, w.shape[1], COLUMNS):
+    @inner
+    def strip(
+        x: np.ndarray, w: np.ndarray, floor: float, first: int, last: int, column: int, out: np.ndarray
+    ) -> None:  # fmt: skip
         row = first
         while row + ROWS <= last:
-            _rows(x, w, out, row, column, floor)
+            block(x, w, out, row, column, floor)
             row += ROWS
         if row < last and last - ROWS >= first:
-            _rows(x, w, out, last - ROWS, column, floor)
+            block(x, w, out, last - ROWS, column, floor)
         else:
             for r in range(row, last):
-                _row(x, w, out, r, column, floor)
+                line(x, w, out, r, column, floor)
+
+    return strip
+
+
+_wide, _thin = _strip(COLUMNS), _strip(1)
+
+
+@inner
+def layer(x: np.ndarray, w: np.ndarray, floor: float, first: int, last: int, out: np.ndarray) -> None:
+    """out[first:last] = max(x[first:last] @ w, floor); a row does not depend on which others there are.
+
+    Widths that are multiples of COLUMNS are fast.
+    """
+    whole = w.shape[1] // COLUMNS * COLUMNS
+    for column in range(0, whole, COLUMNS):
+        _wide(x, w, floor, first, last, column, out)
+    for column in range(whole, w.shape[1]):
+        _thin(x, w, floor, first, last, column, out)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.ahead import AHEAD, occupied_ahead
 from fieldpose.stages.nerf.kernels.space import blocks_away, clip, occupied, skip, to_cube
 from fieldpose.stages.nerf.kernels.types import BLOCK, Domain, Rays, Samples
@@ -16,7 +16,7 @@ from fieldpose.stages.nerf.kernels.vectors import lowest_bit
 TINY, HUGE = np.float32(1e-9), np.float32(1e9)
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def begin(
     dom: Domain, origins: np.ndarray, directions: np.ndarray, jitter: np.ndarray, first: int, count: int, rays: Rays
 ) -> None:
@@ -32,7 +32,7 @@ def begin(
         rays.opacity[r] = 0
         rays.depth[r] = 0
         rays.median[r] = 0
-        rays.feats[r, :] = 0
+        rays.sums[r, :] = 0
 
 
 @njit(inline="always")
@@ -41,7 +41,7 @@ def inverse(component: float) -> float:
     return np.float32(1) / component if abs(component) > TINY else HUGE
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def advance(
     dom: Domain,
     origins: np.ndarray,

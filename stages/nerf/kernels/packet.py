@@ -2,28 +2,28 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
-from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.encoding import encode
 from fieldpose.stages.nerf.kernels.layers import layer
 from fieldpose.stages.nerf.kernels.march import advance, begin
 from fieldpose.stages.nerf.kernels.types import SH_SIZE, Domain, Net, Rays, Samples
-from fieldpose.stages.nerf.kernels.vectors import float_of_bits
+from fieldpose.stages.nerf.kernels.vectors import COLUMNS, add_row, float_of_bits
 
 # Numba compiles a function anew for each literal that it is called with: np.int64(0) and np.bool_(True) are none.
 MAX_EXPONENT, MIN_EXPONENT = np.float32(11.0), np.float32(-80.0)
 HALF = np.float32(0.5)
 LOG2_E = np.float32(1.4426950408889634)
 LN2_HIGH, LN2_LOW = np.float32(0.693359375), np.float32(-2.12194440e-4)
-SMALLEST = np.float32(1e-9)
+THICKEST = np.float32(80)
+HALF_TO_SMALLEST = np.float32(20.03)
+"""Logarithm of 0.5 / 1e-9: no step takes away more than that of what is left."""
 NONE, LEAST = np.float32(0), np.float32(-np.inf)
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def density_network(net: Net, samples: Samples, first: int, last: int) -> None:
     """Fill x, h and out of rows first..last."""
     encode(net, samples, first, last)
@@ -47,43 +47,70 @@ def density(raw: float) -> float:
     return exponential(max(min(raw, MAX_EXPONENT), MIN_EXPONENT))
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def attenuate(samples: Samples, first: int, last: int) -> None:
     """Fill trans of rows first..last with what each lets through of the light that reaches it."""
     out, dt, trans = samples.out.reshape(-1), samples.dt, samples.trans
     width = np.uint64(samples.out.shape[1])
     for s in range(first, last):
         q = np.uint64(s)
-        trans[q] = exponential(-min(density(out[q * width]) * dt[q], np.float32(80)))
+        trans[q] = exponential(-min(density(out[q * width]) * dt[q], THICKEST))
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@njit(inline="always")
+def log_up_to_two(x: float) -> float:
+    """log(x) to 2e-6 for 1 <= x <= 2: twice the areatangent of (x - 1) / (x + 1)."""
+    z = (x - np.float32(1)) / (x + np.float32(1))
+    q = z * z
+    p = np.float32(1 / 7) + q * (np.float32(1 / 9) + q * np.float32(1 / 11))
+    return np.float32(2) * z * (np.float32(1) + q * (np.float32(1 / 3) + q * (np.float32(1 / 5) + q * p)))
+
+
+@njit(inline="always")
+def half_way(before: float, thickness: float) -> float:
+    """Which share of a step of this optical thickness, before which `before` >= 0.5 of the light is left, leaves 0.5."""
+    to_half = log_up_to_two(before / HALF)
+    return to_half / min(thickness, to_half + HALF_TO_SMALLEST)
+
+
+@inner
 def composite(samples: Samples, first: int, last: int, stop_below: float, rays: Rays) -> None:
-    """Accumulate rows first..last into their rays, and end the rays whose transmittance falls below the limit."""
-    features = samples.out.shape[1] - 1
+    """Accumulate rows first..last into their rays, and end the rays whose transmittance falls below the limit.
+
+    A ray's rows stand together.
+    """
+    out, sums, width = samples.out.reshape(-1), rays.sums.reshape(-1), samples.out.shape[1]
     attenuate(samples, first, last)
-    for s in range(first, last):
+    s = first
+    while s < last:
         r = samples.ray[s]
-        before = rays.trans[r]
-        if before < stop_below:
-            samples.weight[s] = 0
-            samples.trans[s] = before
-            continue
-        after = before * samples.trans[s]
-        weight = before - after
-        samples.weight[s], samples.trans[s], rays.trans[r] = weight, after, after
-        rays.opacity[r] += weight
-        rays.depth[r] += weight * samples.t[s]
-        if before >= HALF and after < HALF:
-            share = math.log(before / HALF) / math.log(before / max(after, SMALLEST))
-            rays.median[r] = samples.t[s] + samples.dt[s] * (share - HALF)
-        for f in range(features):
-            rays.feats[r, f] += weight * samples.out[s, 1 + f]
+        after, opacity, depth = rays.trans[r], rays.opacity[r], rays.depth[r]
+        while s < last and samples.ray[s] == r:
+            before = after
+            if before < stop_below:
+                samples.weight[s], samples.trans[s] = 0, before
+                s += 1
+                continue
+            after = before * samples.trans[s]
+            weight = before - after
+            samples.weight[s], samples.trans[s] = weight, after
+            opacity += weight
+            depth += weight * samples.t[s]
+            if before >= HALF and after < HALF:
+                share = half_way(before, density(out[s * width]) * samples.dt[s])
+                rays.median[r] = samples.t[s] + samples.dt[s] * (share - HALF)
+            if width == COLUMNS:
+                add_row(weight, out, s * width, sums, r * width)
+            else:
+                for f in range(width):
+                    sums[r * width + f] += weight * out[s * width + f]
+            s += 1
+        rays.trans[r], rays.opacity[r], rays.depth[r] = after, opacity, depth
         if after < stop_below:
             rays.alive[r] = False
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def harmonics(d: np.ndarray, out: np.ndarray, at: int) -> None:
     """Real spherical harmonics of degree 0 to 3 of the unit direction d, written to out[at:at + 16]."""
     x, y, z = d[0], d[1], d[2]
@@ -99,11 +126,13 @@ def harmonics(d: np.ndarray, out: np.ndarray, at: int) -> None:
         out[at + i] = values[i]
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def colour_network(net: Net, directions: np.ndarray, first: int, count: int, rays: Rays) -> None:
     """Fill the view-dependent part of the colour, rays.rgb, from the composited features."""
     features = rays.feats.shape[1] - SH_SIZE
     for r in range(count):
+        for f in range(features):
+            rays.feats[r, f] = rays.sums[r, 1 + f]
         harmonics(directions[first + r], rays.feats[r], features)
     zero = np.int64(0)
     layer(rays.feats, net.c1, NONE, zero, count, rays.h1)
@@ -126,7 +155,7 @@ def surface(rays: Rays, r: int) -> float:
     return rays.depth[r] / rays.opacity[r] if rays.opacity[r] > np.float32(1e-4) else np.float32(0)
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def forward(
     net: Net,
     dom: Domain,
@@ -149,7 +178,7 @@ def forward(
     return trace(net, dom, origins, directions, first, count, per_ray, stop_below, keep, samples, rays)
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def trace(
     net: Net,
     dom: Domain,
@@ -177,4 +206,5 @@ def trace(
         colour_network(net, directions, first, count, rays)
     else:
         rays.rgb[:count] = 0
+        rays.feats[:count] = 0
     return row, evaluated

@@ -9,6 +9,7 @@ from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
 from fieldpose.stages.kernel_cache import cached_njit
+from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.types import BLOCK, Domain, Rays
 
 NEVER = np.float32(np.inf)
@@ -78,7 +79,7 @@ def tile_limits(
                 limits[row, column, 1] = max(limits[row, column, 1], far)
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def narrow(dom: Domain, near: float, far: float, count: int, rays: Rays) -> None:
     """Hold the packet's rays, which are at their start, between two distances; samples stay where they were."""
     step = np.float32(dom.step)

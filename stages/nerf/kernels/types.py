@@ -67,6 +67,7 @@ class Rays(NamedTuple):
     trans: np.ndarray
     last: np.ndarray  # row of the ray's newest sample, -1 without
     alive: np.ndarray
+    sums: np.ndarray  # (r, 1 + features) weighted sums of the samples' outputs
     feats: np.ndarray  # (r, features + SH_SIZE) composited features, then the direction's harmonics
     opacity: np.ndarray
     depth: np.ndarray  # weighted mean of the samples' distances, not divided by the opacity

@@ -56,6 +56,7 @@ def new_rays(config: FieldConfig, count: int) -> Rays:
         return np.zeros(shape, np.float32)
 
     return Rays(
+        lines=array(9, count),
         t=array(count),
         far=array(count),
         trans=array(count),

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.nerf.kernels.inner import inner
-from fieldpose.stages.nerf.kernels.ahead import AHEAD, occupied_ahead
+from fieldpose.stages.nerf.kernels.ahead import AHEAD, leap, occupied_ahead
 from fieldpose.stages.nerf.kernels.space import blocks_away, clip, occupied, skip, to_cube
 from fieldpose.stages.nerf.kernels.types import BLOCK, Domain, Rays, Samples
 from fieldpose.stages.nerf.kernels.vectors import lowest_bit
@@ -16,13 +16,22 @@ from fieldpose.stages.nerf.kernels.vectors import lowest_bit
 TINY, HUGE = np.float32(1e-9), np.float32(1e9)
 
 
+@njit(inline="always")
+def inverse(component: float) -> float:
+    """1 / component, large where the ray does not move along the axis."""
+    return np.float32(1) / component if abs(component) > TINY else HUGE
+
+
 @inner
 def begin(
     dom: Domain, origins: np.ndarray, directions: np.ndarray, jitter: np.ndarray, first: int, count: int, rays: Rays
 ) -> None:
     """Put rays first..first+count at the start of their way; the packet's arrays are cleared."""
+    m = np.float32(dom.resolution // BLOCK)
     for r in range(count):
         o, d = origins[first + r], directions[first + r]
+        for a in range(3):
+            rays.lines[a, r], rays.lines[3 + a, r], rays.lines[6 + a, r] = o[a], d[a], inverse(d[a]) / m
         near, far = clip(dom, o, d)
         rays.t[r] = near + jitter[first + r] * dom.step
         rays.far[r] = far
@@ -35,41 +44,27 @@ def begin(
         rays.sums[r, :] = 0
 
 
-@njit(inline="always")
-def inverse(component: float) -> float:
-    """1 / component, large where the ray does not move along the axis."""
-    return np.float32(1) / component if abs(component) > TINY else HUGE
-
-
 @inner
-def advance(
-    dom: Domain,
-    origins: np.ndarray,
-    directions: np.ndarray,
-    first: int,
-    count: int,
-    per_ray: int,
-    row: int,
-    rays: Rays,
-    samples: Samples,
-) -> int:
+def advance(dom: Domain, count: int, per_ray: int, row: int, rays: Rays, samples: Samples) -> int:
     """Append up to `per_ray` occupied samples of each living ray after `row`; return the new end.
 
     Samples of a ray lie on t0 + i * step whatever was skipped, so that every way to skip gives the same samples.
     """
     n, m = np.float32(dom.resolution), np.float32(dom.resolution // BLOCK)
     step, half, zero = np.float32(dom.step), np.float32(0.5), np.float32(0)
-    contracted, bits, distance = dom.contracted, dom.bits, dom.distance
+    contracted, bits, distance, lines = dom.contracted, dom.bits, dom.distance, rays.lines
     capacity = samples.t.shape[0]
+    if not contracted and count >= AHEAD:
+        for r in range(0, count, AHEAD):
+            leap(distance, m, step, lines, rays.t, rays.far, rays.alive, min(r, count - AHEAD))
     for r in range(count):
         if not rays.alive[r]:
             continue
-        o0, o1, o2 = origins[first + r, 0], origins[first + r, 1], origins[first + r, 2]
-        d0, d1, d2 = directions[first + r, 0], directions[first + r, 1], directions[first + r, 2]
+        o0, o1, o2, d0, d1, d2 = lines[0, r], lines[1, r], lines[2, r], lines[3, r], lines[4, r], lines[5, r]
         t, far, last = rays.t[r], rays.far[r], rays.last[r]
         end = min(row + per_ray, capacity)
         if not contracted:
-            i0, i1, i2 = inverse(d0) / m, inverse(d1) / m, inverse(d2) / m
+            i0, i1, i2 = lines[6, r], lines[7, r], lines[8, r]
             h0, h1, h2 = half * step * d0, half * step * d1, half * step * d2
             while row < end and t < far:
                 u0, u1, u2, _ = to_cube(False, o0 + t * d0, o1 + t * d1, o2 + t * d2)

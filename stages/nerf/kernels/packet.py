@@ -127,13 +127,13 @@ def harmonics(d: np.ndarray, out: np.ndarray, at: int) -> None:
 
 
 @inner
-def colour_network(net: Net, directions: np.ndarray, first: int, count: int, rays: Rays) -> None:
+def colour_network(net: Net, count: int, rays: Rays) -> None:
     """Fill the view-dependent part of the colour, rays.rgb, from the composited features."""
     features = rays.feats.shape[1] - SH_SIZE
     for r in range(count):
         for f in range(features):
             rays.feats[r, f] = rays.sums[r, 1 + f]
-        harmonics(directions[first + r], rays.feats[r], features)
+        harmonics(rays.lines[3:6, r], rays.feats[r], features)
     zero = np.int64(0)
     layer(rays.feats, net.c1, NONE, zero, count, rays.h1)
     layer(rays.h1, net.c2, NONE, zero, count, rays.h2)
@@ -175,16 +175,13 @@ def forward(
     With `keep` the rows of all rounds stay, for the backward pass; without, each round reuses them.
     """
     begin(dom, origins, directions, jitter, first, count, rays)
-    return trace(net, dom, origins, directions, first, count, per_ray, stop_below, keep, samples, rays)
+    return trace(net, dom, count, per_ray, stop_below, keep, samples, rays)
 
 
 @inner
 def trace(
     net: Net,
     dom: Domain,
-    origins: np.ndarray,
-    directions: np.ndarray,
-    first: int,
     count: int,
     per_ray: int,
     stop_below: float,
@@ -196,14 +193,14 @@ def trace(
     row, evaluated = np.int64(0), 0
     while True:
         start = row if keep else np.int64(0)
-        row = advance(dom, origins, directions, first, count, per_ray, start, rays, samples)
+        row = advance(dom, count, per_ray, start, rays, samples)
         if row == start:
             break
         density_network(net, samples, start, row)
         composite(samples, start, row, stop_below, rays)
         evaluated += row - start
     if evaluated > 0:
-        colour_network(net, directions, first, count, rays)
+        colour_network(net, count, rays)
     else:
         rays.rgb[:count] = 0
         rays.feats[:count] = 0

@@ -99,9 +99,7 @@ def render_tiles(
                 directions[r, c] = x * turn[0, c] + y * turn[1, c] + z * turn[2, c]
         begin(dom, origins, directions, middle, zero, count, rays)
         narrow(dom, limits[tile, 0], limits[tile, 1], count, rays)
-        _, evaluated = trace(
-            net, dom, origins, directions, zero, count, per_ray, stop_below, np.bool_(False), samples, rays
-        )
+        _, evaluated = trace(net, dom, count, per_ray, stop_below, np.bool_(False), samples, rays)
         total += evaluated
         for r in range(count):
             pixel = tiles.pixel[start + r]

@@ -62,6 +62,7 @@ class Samples(NamedTuple):
 class Rays(NamedTuple):
     """State of the rays of a packet."""
 
+    lines: np.ndarray  # (9, r) origin, unit direction, and 1 / direction in blocks of the occupancy grid
     t: np.ndarray
     far: np.ndarray
     trans: np.ndarray

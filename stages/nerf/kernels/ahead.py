@@ -1,4 +1,4 @@
-"""Eight rays, or eight steps of one, looked up in the occupancy grid at once; uncontracted space."""
+"""Several rays, or several steps of one, looked up in the occupancy grid at once; uncontracted space."""
 
 from __future__ import annotations
 
@@ -12,11 +12,17 @@ from numba.extending import intrinsic
 from fieldpose.stages.nerf.kernels.vectors import CONTRACT, F32, I32, I64, data_of, in_all_lanes, vector_at
 
 AHEAD = 8
-_FLOATS, _INTS, _BYTES = (ir.VectorType(kind, AHEAD) for kind in (F32, I32, ir.IntType(8)))
+"""Steps that are looked up at once."""
+ABREAST = 16
+"""Rays that leap at once."""
 
 
-def _all(value: float) -> ir.Constant:
-    return ir.Constant(_FLOATS, [float(value)] * AHEAD)
+def _every(value: float, lanes: int) -> ir.Constant:
+    return ir.Constant(ir.VectorType(F32, lanes), [float(value)] * lanes)
+
+
+def _ints(value: int, lanes: int) -> ir.Constant:
+    return ir.Constant(ir.VectorType(I32, lanes), [value] * lanes)
 
 
 def _least(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
@@ -29,36 +35,31 @@ def _most(builder: ir.IRBuilder, a: ir.Value, b: ir.Value) -> ir.Value:
 
 def _cell(builder: ir.IRBuilder, place: ir.Value, size: ir.Value) -> ir.Value:
     """Index of the cell at a place along an axis of `size` cells."""
-    return builder.fptosi(_least(builder, _most(builder, place, _all(0)), builder.fsub(size, _all(1))), _INTS)
+    lanes = place.type.count
+    held = _least(builder, _most(builder, place, _every(0, lanes)), builder.fsub(size, _every(1, lanes)))
+    return builder.fptosi(held, ir.VectorType(I32, lanes))
 
 
-def _flat(builder: ir.IRBuilder, cells: list[ir.Value], size: ir.Value) -> ir.Value:
-    x, y, z = cells
-    n = builder.fptosi(size, _INTS)
+def _flat(builder: ir.IRBuilder, places: list[ir.Value], size: ir.Value) -> ir.Value:
+    """Flat index of the cells at places along the three axes."""
+    x, y, z = (_cell(builder, place, size) for place in places)
+    n = builder.fptosi(size, x.type)
     return builder.add(x, builder.mul(n, builder.add(y, builder.mul(n, z))))
 
 
 def _bytes_at(builder: ir.IRBuilder, data: ir.Value, places: ir.Value) -> ir.Value:
     """data[places] as int32. Loads one by one: where there are instructions for it, they are no faster."""
-    values = ir.Constant(_INTS, ir.Undefined)
-    for i in range(AHEAD):
+    values = ir.Constant(places.type, ir.Undefined)
+    for i in range(places.type.count):
         lane = ir.Constant(I32, i)
         byte = builder.load(builder.gep(data, [builder.extract_element(places, lane)]))
         values = builder.insert_element(values, builder.zext(byte, I32), lane)
     return values
 
 
-def _rounded(builder: ir.IRBuilder, name: str, value: ir.Value) -> ir.Value:
-    kind = ir.FunctionType(_FLOATS, [_FLOATS])
-    return builder.call(cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{AHEAD}f32"), [value])
-
-
-def _indices(builder: ir.IRBuilder, u: ir.Value, change: ir.Value, size: ir.Value) -> ir.Value:
-    """Of the cells along an axis."""
-    steps = ir.Constant(_FLOATS, [float(i) for i in range(AHEAD)])
-    way = builder.fmul(steps, in_all_lanes(builder, change, AHEAD), flags=CONTRACT)
-    place = builder.fmul(builder.fadd(way, in_all_lanes(builder, u, AHEAD), flags=CONTRACT), size)
-    return _cell(builder, place, size)
+def _rounded(builder: ir.IRBuilder, way: str, value: ir.Value) -> ir.Value:
+    name, kind = f"llvm.{way}.v{value.type.count}f32", ir.FunctionType(value.type, [value.type])
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [value])
 
 
 @intrinsic
@@ -70,14 +71,17 @@ def occupied_ahead(typing_context, bits, resolution, u0, u1, u2, d0, d1, d2):  #
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> ir.Value:
         size = in_all_lanes(builder, arguments[1], AHEAD)
-        cells = [_indices(builder, arguments[2 + a], arguments[5 + a], size) for a in range(3)]
-        flat = _flat(builder, cells, size)
+        steps = ir.Constant(ir.VectorType(F32, AHEAD), [float(i) for i in range(AHEAD)])
+        places = []
+        for u, d in zip(arguments[2:5], arguments[5:8], strict=True):
+            way = builder.fmul(steps, in_all_lanes(builder, d, AHEAD), flags=CONTRACT)
+            places.append(builder.fmul(builder.fadd(way, in_all_lanes(builder, u, AHEAD), flags=CONTRACT), size))
+        flat = _flat(builder, places, size)
         data = data_of(context, builder, signature.args[0], arguments[0])
-        words = _bytes_at(builder, data, builder.lshr(flat, ir.Constant(_INTS, [3] * AHEAD)))
-        shift = builder.and_(flat, ir.Constant(_INTS, [7] * AHEAD))
-        wanted = builder.shl(ir.Constant(_INTS, [1] * AHEAD), shift)
-        found = builder.icmp_unsigned("!=", builder.and_(words, wanted), ir.Constant(_INTS, [0] * AHEAD))
-        return builder.zext(builder.bitcast(found, ir.IntType(AHEAD)), ir.IntType(64))
+        found = _bytes_at(builder, data, builder.lshr(flat, _ints(3, AHEAD)))
+        wanted = builder.shl(_ints(1, AHEAD), builder.and_(flat, _ints(7, AHEAD)))
+        bits = builder.icmp_unsigned("!=", builder.and_(found, wanted), _ints(0, AHEAD))
+        return builder.zext(builder.bitcast(bits, ir.IntType(AHEAD)), I64)
 
     f = types.float32
     return types.int64(bits, f, f, f, f, f, f, f), generate
@@ -85,55 +89,57 @@ def occupied_ahead(typing_context, bits, resolution, u0, u1, u2, d0, d1, d2):  #
 
 @intrinsic
 def leap(typing_context, distance, blocks, step, lines, t, far, alive, at):  # type: ignore[no-untyped-def]
-    """Move living rays at..at + AHEAD by whole steps to where a block with an occupied cell is, or past their ends.
+    """Move living rays at..at + ABREAST by whole steps to where a block has an occupied cell, or past their ends.
 
     distance as `Domain` has it, of a grid with `blocks` blocks along each side; blocks and step float32.
     """
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> ir.Value:
-        kinds, at = signature.args, arguments[7]
-        table = data_of(context, builder, kinds[0], arguments[0])
-        size, step = (in_all_lanes(builder, arguments[i], AHEAD) for i in (1, 2))
+        kinds, at, lanes = signature.args, arguments[7], ABREAST
+        floats, bytes_ = ir.VectorType(F32, lanes), ir.VectorType(ir.IntType(8), lanes)
+        table, times, ends, flags = (data_of(context, builder, kinds[i], arguments[i]) for i in (0, 4, 5, 6))
+        size, step = (in_all_lanes(builder, arguments[i], lanes) for i in (1, 2))
         lines = context.make_array(kinds[3])(context, builder, arguments[3])
         stride = builder.extract_value(lines.shape, 1)
-        ways = []
-        for i in range(9):
-            place = builder.add(at, builder.mul(stride, ir.Constant(I64, i)))
-            ways.append(builder.load(vector_at(builder, lines.data, place, _FLOATS), align=4))
-        times = vector_at(builder, data_of(context, builder, kinds[4], arguments[4]), at, _FLOATS)
-        ends = builder.load(vector_at(builder, data_of(context, builder, kinds[5], arguments[5]), at, _FLOATS), align=4)
-        flags = vector_at(builder, data_of(context, builder, kinds[6], arguments[6]), at, _BYTES)
-        living = builder.icmp_unsigned("!=", builder.load(flags, align=1), ir.Constant(_BYTES, [0] * AHEAD))
+        starts = [builder.add(at, builder.mul(stride, ir.Constant(I64, i))) for i in range(9)]
+        ways = [builder.load(vector_at(builder, lines.data, start, floats), align=4) for start in starts]
+        end = builder.load(vector_at(builder, ends, at, floats), align=4)
+        living = builder.load(vector_at(builder, flags, at, bytes_), align=1)
+        living = builder.icmp_unsigned("!=", living, ir.Constant(bytes_, [0] * lanes))
+        begun, before = builder.load(vector_at(builder, times, at, floats), align=4), builder.block
         look, move, done = (builder.append_basic_block(name) for name in ("look", "move", "done"))
-        begun, before = builder.load(times, align=4), builder.block
         builder.branch(look)
+
         builder.position_at_end(look)
-        now = builder.phi(_FLOATS)
+        now = builder.phi(floats)
         now.add_incoming(begun, before)
         places = []
         for o, d in zip(ways[:3], ways[3:6], strict=True):
             y = builder.fadd(o, builder.fmul(now, d, flags=CONTRACT), flags=CONTRACT)
-            places.append(builder.fmul(builder.fmul(builder.fadd(y, _all(1)), _all(0.5)), size))
-        empty = _bytes_at(builder, table, _flat(builder, [_cell(builder, p, size) for p in places], size))
-        going = builder.and_(living, builder.fcmp_ordered("<", now, ends))
-        going = builder.and_(going, builder.icmp_unsigned("!=", empty, ir.Constant(_INTS, [0] * AHEAD)))
-        some = builder.icmp_unsigned("!=", builder.bitcast(going, ir.IntType(AHEAD)), ir.Constant(ir.IntType(AHEAD), 0))
-        builder.cbranch(some, move, done)
+            u = builder.fmul(builder.fadd(y, _every(1, lanes)), _every(0.5, lanes))
+            places.append(builder.fmul(u, size))
+        away = _bytes_at(builder, table, _flat(builder, places, size))
+        going = builder.and_(living, builder.fcmp_ordered("<", now, end))
+        going = builder.and_(going, builder.icmp_unsigned("!=", away, _ints(0, lanes)))
+        which = builder.bitcast(going, ir.IntType(lanes))
+        builder.cbranch(builder.icmp_unsigned("!=", which, ir.Constant(which.type, 0)), move, done)
+
         builder.position_at_end(move)
-        reach = builder.fsub(builder.sitofp(empty, _FLOATS), _all(1))
+        reach = builder.fsub(builder.sitofp(away, floats), _every(1, lanes))
         free = None
         for place, inverse in zip(places, ways[6:], strict=True):
             index = _rounded(builder, "floor", place)
-            low, high = builder.fsub(index, reach), builder.fadd(builder.fadd(index, _all(1)), reach)
-            border = builder.select(builder.fcmp_ordered(">", inverse, _all(0)), high, low)
-            axis = builder.fmul(builder.fmul(builder.fsub(border, place), _all(2)), inverse)
-            free = axis if free is None else _least(builder, free, axis)
-        steps = _most(builder, _rounded(builder, "ceil", builder.fdiv(free, step)), _all(1))
+            low, high = builder.fsub(index, reach), builder.fadd(builder.fadd(index, _every(1, lanes)), reach)
+            border = builder.select(builder.fcmp_ordered(">", inverse, _every(0, lanes)), high, low)
+            along = builder.fmul(builder.fmul(builder.fsub(border, place), _every(2, lanes)), inverse)
+            free = along if free is None else _least(builder, free, along)
+        steps = _most(builder, _rounded(builder, "ceil", builder.fdiv(free, step)), _every(1, lanes))
         later = builder.fadd(now, builder.fmul(step, steps, flags=CONTRACT), flags=CONTRACT)
         now.add_incoming(builder.select(going, later, now), builder.block)
         builder.branch(look)
+
         builder.position_at_end(done)
-        builder.store(now, times, align=4)
+        builder.store(now, vector_at(builder, times, at, floats), align=4)
         return context.get_dummy_value()
 
     f, i64 = types.float32, types.int64

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.nerf.kernels.inner import inner
-from fieldpose.stages.nerf.kernels.ahead import AHEAD, leap, occupied_ahead
+from fieldpose.stages.nerf.kernels.ahead import ABREAST, AHEAD, leap, occupied_ahead
 from fieldpose.stages.nerf.kernels.space import blocks_away, clip, occupied, skip, to_cube
 from fieldpose.stages.nerf.kernels.types import BLOCK, Domain, Rays, Samples
 from fieldpose.stages.nerf.kernels.vectors import lowest_bit
@@ -54,9 +54,9 @@ def advance(dom: Domain, count: int, per_ray: int, row: int, rays: Rays, samples
     step, half, zero = np.float32(dom.step), np.float32(0.5), np.float32(0)
     contracted, bits, distance, lines = dom.contracted, dom.bits, dom.distance, rays.lines
     capacity = samples.t.shape[0]
-    if not contracted and count >= AHEAD:
-        for r in range(0, count, AHEAD):
-            leap(distance, m, step, lines, rays.t, rays.far, rays.alive, min(r, count - AHEAD))
+    if not contracted and count >= ABREAST:
+        for r in range(0, count, ABREAST):
+            leap(distance, m, step, lines, rays.t, rays.far, rays.alive, min(r, count - ABREAST))
     for r in range(count):
         if not rays.alive[r]:
             continue

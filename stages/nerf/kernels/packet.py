@@ -53,8 +53,10 @@ def attenuate(samples: Samples, first: int, last: int) -> None:
     out, dt, trans = samples.out.reshape(-1), samples.dt, samples.trans
     width = np.uint64(samples.out.shape[1])
     for s in range(first, last):
+        trans[np.uint64(s)] = out[np.uint64(s) * width]
+    for s in range(first, last):
         q = np.uint64(s)
-        trans[q] = exponential(-min(density(out[q * width]) * dt[q], THICKEST))
+        trans[q] = exponential(-min(density(trans[q]) * dt[q], THICKEST))
 
 
 @njit(inline="always")

@@ -13,6 +13,7 @@ import numpy as np
 
 from fieldpose.stages.nerf.blas import SingleThreadedBlas
 from fieldpose.stages.nerf.config import FieldConfig
+from fieldpose.stages.nerf.kernels.ahead import ABREAST
 from fieldpose.stages.nerf.kernels.plan import LANES
 from fieldpose.stages.nerf.kernels.types import SH_SIZE, Rays, Samples
 from fieldpose.stages.nerf.kernels.vectors import BLOCK
@@ -56,12 +57,12 @@ def new_rays(config: FieldConfig, count: int) -> Rays:
         return np.zeros(shape, np.float32)
 
     return Rays(
-        lines=array(9, count),
-        t=array(count),
-        far=array(count),
+        lines=array(9, count + ABREAST),
+        t=array(count + ABREAST),
+        far=array(count + ABREAST),
         trans=array(count),
         last=np.zeros(count, np.int32),
-        alive=np.zeros(count, np.bool_),
+        alive=np.zeros(count + ABREAST, np.bool_),
         sums=array(count, 1 + config.features),
         feats=array(count, width),
         opacity=array(count),

@@ -57,6 +57,14 @@ def _bytes_at(builder: ir.IRBuilder, data: ir.Value, places: ir.Value) -> ir.Val
     return values
 
 
+def _bits_at(builder: ir.IRBuilder, data: ir.Value, places: ir.Value) -> ir.Value:
+    """Whether the bits at these places are set."""
+    lanes = places.type.count
+    found = _bytes_at(builder, data, builder.lshr(places, _ints(3, lanes)))
+    wanted = builder.shl(_ints(1, lanes), builder.and_(places, _ints(7, lanes)))
+    return builder.icmp_unsigned("!=", builder.and_(found, wanted), _ints(0, lanes))
+
+
 def _rounded(builder: ir.IRBuilder, way: str, value: ir.Value) -> ir.Value:
     name, kind = f"llvm.{way}.v{value.type.count}f32", ir.FunctionType(value.type, [value.type])
     return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [value])
@@ -78,28 +86,27 @@ def occupied_ahead(typing_context, bits, resolution, u0, u1, u2, d0, d1, d2):  #
             places.append(builder.fmul(builder.fadd(way, in_all_lanes(builder, u, AHEAD), flags=CONTRACT), size))
         flat = _flat(builder, places, size)
         data = data_of(context, builder, signature.args[0], arguments[0])
-        found = _bytes_at(builder, data, builder.lshr(flat, _ints(3, AHEAD)))
-        wanted = builder.shl(_ints(1, AHEAD), builder.and_(flat, _ints(7, AHEAD)))
-        bits = builder.icmp_unsigned("!=", builder.and_(found, wanted), _ints(0, AHEAD))
-        return builder.zext(builder.bitcast(bits, ir.IntType(AHEAD)), I64)
+        return builder.zext(builder.bitcast(_bits_at(builder, data, flat), ir.IntType(AHEAD)), I64)
 
     f = types.float32
     return types.int64(bits, f, f, f, f, f, f, f), generate
 
 
 @intrinsic
-def leap(typing_context, distance, blocks, step, lines, t, far, alive, at):  # type: ignore[no-untyped-def]
-    """Move living rays at..at + ABREAST by whole steps to where a block has an occupied cell, or past their ends.
+def leap(typing_context, bits, distance, cells, blocks, step, lines, t, far, alive, at):  # type: ignore[no-untyped-def]
+    """Move living rays at..at + ABREAST by whole steps into the next occupied cell, or past their ends.
 
-    distance as `Domain` has it, of a grid with `blocks` blocks along each side; blocks and step float32.
+    bits and distance as `Domain` has them, of a grid with so many cells and blocks along each side; these and the step
+    are float32.
     """
 
     def generate(context: Any, builder: ir.IRBuilder, signature: Any, arguments: Any) -> ir.Value:
-        kinds, at, lanes = signature.args, arguments[7], ABREAST
+        kinds, at, lanes = signature.args, arguments[9], ABREAST
         floats, bytes_ = ir.VectorType(F32, lanes), ir.VectorType(ir.IntType(8), lanes)
-        table, times, ends, flags = (data_of(context, builder, kinds[i], arguments[i]) for i in (0, 4, 5, 6))
-        size, step = (in_all_lanes(builder, arguments[i], lanes) for i in (1, 2))
-        lines = context.make_array(kinds[3])(context, builder, arguments[3])
+        bits, table, times, ends, flags = (data_of(context, builder, kinds[i], arguments[i]) for i in (0, 1, 6, 7, 8))
+        fine, coarse, step = (in_all_lanes(builder, arguments[i], lanes) for i in (2, 3, 4))
+        per_block = builder.fdiv(fine, coarse)
+        lines = context.make_array(kinds[5])(context, builder, arguments[5])
         stride = builder.extract_value(lines.shape, 1)
         starts = [builder.add(at, builder.mul(stride, ir.Constant(I64, i))) for i in range(9)]
         ways = [builder.load(vector_at(builder, lines.data, start, floats), align=4) for start in starts]
@@ -116,23 +123,29 @@ def leap(typing_context, distance, blocks, step, lines, t, far, alive, at):  # t
         places = []
         for o, d in zip(ways[:3], ways[3:6], strict=True):
             y = builder.fadd(o, builder.fmul(now, d, flags=CONTRACT), flags=CONTRACT)
-            u = builder.fmul(builder.fadd(y, _every(1, lanes)), _every(0.5, lanes))
-            places.append(builder.fmul(u, size))
-        away = _bytes_at(builder, table, _flat(builder, places, size))
+            places.append(builder.fmul(builder.fadd(y, _every(1, lanes)), _every(0.5, lanes)))
+        of_block = [builder.fmul(place, coarse) for place in places]
+        of_cell = [builder.fmul(place, fine) for place in places]
+        away = _bytes_at(builder, table, _flat(builder, of_block, coarse))
+        empty = builder.icmp_unsigned("!=", away, _ints(0, lanes))
+        occupied = _bits_at(builder, bits, _flat(builder, of_cell, fine))
         going = builder.and_(living, builder.fcmp_ordered("<", now, end))
-        going = builder.and_(going, builder.icmp_unsigned("!=", away, _ints(0, lanes)))
+        going = builder.and_(going, builder.not_(occupied))
         which = builder.bitcast(going, ir.IntType(lanes))
         builder.cbranch(builder.icmp_unsigned("!=", which, ir.Constant(which.type, 0)), move, done)
 
         builder.position_at_end(move)
-        reach = builder.fsub(builder.sitofp(away, floats), _every(1, lanes))
+        reach = builder.select(empty, builder.fsub(builder.sitofp(away, floats), _every(1, lanes)), _every(0, lanes))
+        scale = builder.select(empty, _every(2, lanes), builder.fdiv(_every(2, lanes), per_block))
         free = None
-        for place, inverse in zip(places, ways[6:], strict=True):
+        for block, cell, inverse in zip(of_block, of_cell, ways[6:], strict=True):
+            place = builder.select(empty, block, cell)
             index = _rounded(builder, "floor", place)
             low, high = builder.fsub(index, reach), builder.fadd(builder.fadd(index, _every(1, lanes)), reach)
             border = builder.select(builder.fcmp_ordered(">", inverse, _every(0, lanes)), high, low)
-            along = builder.fmul(builder.fmul(builder.fsub(border, place), _every(2, lanes)), inverse)
+            along = builder.fmul(builder.fsub(border, place), inverse)
             free = along if free is None else _least(builder, free, along)
+        free = builder.fmul(free, scale)
         steps = _most(builder, _rounded(builder, "ceil", builder.fdiv(free, step)), _every(1, lanes))
         later = builder.fadd(now, builder.fmul(step, steps, flags=CONTRACT), flags=CONTRACT)
         now.add_incoming(builder.select(going, later, now), builder.block)
@@ -143,4 +156,4 @@ def leap(typing_context, distance, blocks, step, lines, t, far, alive, at):  # t
         return context.get_dummy_value()
 
     f, i64 = types.float32, types.int64
-    return types.void(distance, f, f, lines, t, far, alive, i64), generate
+    return types.void(bits, distance, f, f, f, lines, t, far, alive, i64), generate

@@ -96,7 +96,7 @@ def render_jacobian(
 
     Where the samples lie along the ray is held fixed.
     """
-    size = rays.t.shape[0]
+    size = rays.opacity.shape[0]
     drgb = np.empty((size, 3), np.float32)
     du = np.empty((3, samples.t.shape[0]), np.float32)
     for start in range(first, last, size):

@@ -9,7 +9,7 @@ from numba import njit
 
 from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.ahead import ABREAST, AHEAD, leap, occupied_ahead
-from fieldpose.stages.nerf.kernels.space import blocks_away, clip, occupied, skip, to_cube
+from fieldpose.stages.nerf.kernels.space import clip, occupied, to_cube
 from fieldpose.stages.nerf.kernels.types import BLOCK, Domain, Rays, Samples
 from fieldpose.stages.nerf.kernels.vectors import lowest_bit
 
@@ -28,6 +28,7 @@ def begin(
 ) -> None:
     """Put rays first..first+count at the start of their way; the packet's arrays are cleared."""
     m = np.float32(dom.resolution // BLOCK)
+    rays.alive[count:] = False
     for r in range(count):
         o, d = origins[first + r], directions[first + r]
         for a in range(3):
@@ -54,9 +55,9 @@ def advance(dom: Domain, count: int, per_ray: int, row: int, rays: Rays, samples
     step, half, zero = np.float32(dom.step), np.float32(0.5), np.float32(0)
     contracted, bits, distance, lines = dom.contracted, dom.bits, dom.distance, rays.lines
     capacity = samples.t.shape[0]
-    if not contracted and count >= ABREAST:
+    if not contracted:
         for r in range(0, count, ABREAST):
-            leap(distance, m, step, lines, rays.t, rays.far, rays.alive, min(r, count - ABREAST))
+            leap(bits, distance, n, m, step, lines, rays.t, rays.far, rays.alive, r)
     for r in range(count):
         if not rays.alive[r]:
             continue
@@ -64,16 +65,9 @@ def advance(dom: Domain, count: int, per_ray: int, row: int, rays: Rays, samples
         t, far, last = rays.t[r], rays.far[r], rays.last[r]
         end = min(row + per_ray, capacity)
         if not contracted:
-            i0, i1, i2 = lines[6, r], lines[7, r], lines[8, r]
-            h0, h1, h2 = half * step * d0, half * step * d1, half * step * d2
-            while row < end and t < far:
+            if t < far and row < end:
                 u0, u1, u2, _ = to_cube(False, o0 + t * d0, o1 + t * d1, o2 + t * d2)
-                empty = blocks_away(distance, m, u0, u1, u2)
-                if empty > 0:
-                    ahead = skip(m, np.float32(empty - 1), u0, u1, u2, i0, i1, i2)
-                    t += step * max(np.float32(1), np.ceil(ahead / step))
-                    continue
-                found = occupied_ahead(bits, n, u0, u1, u2, h0, h1, h2)
+                found = occupied_ahead(bits, n, u0, u1, u2, half * step * d0, half * step * d1, half * step * d2)
                 begun, t = t, t + step * np.float32(AHEAD)
                 while found != 0:
                     t_sample = begun + step * np.float32(lowest_bit(found))
@@ -113,6 +107,6 @@ def advance(dom: Domain, count: int, per_ray: int, row: int, rays: Rays, samples
                         y0, y1, y2 = o0 + t * d0, o1 + t * d1, o2 + t * d2
                         t += step * max(np.float32(1), np.float32(math.sqrt(y0 * y0 + y1 * y1 + y2 * y2)))
         rays.t[r], rays.last[r] = t, last
-        if t >= far or row < end:
+        if t >= far:
             rays.alive[r] = False
     return row

@@ -32,7 +32,7 @@ def render(
     opacity: np.ndarray,
 ) -> int:
     """Fill rgb, depth (distance along the unit direction, 0 where nothing) and opacity; return the samples used."""
-    size = rays.t.shape[0]
+    size = rays.opacity.shape[0]
     total = 0
     for start in range(first, last, size):
         count = min(size, last - start)
@@ -80,7 +80,7 @@ def render_tiles(
     into the camera's axes and origin (3,) of the field's coordinates, whose unit is `scale` of the caller's.  depth is
     along the optical axis.
     """
-    size, total, zero = rays.t.shape[0], 0, np.int64(0)
+    size, total, zero = rays.opacity.shape[0], 0, np.int64(0)
     origins, directions = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32)
     middle = np.full(size, np.float32(0.5))
     origins[:] = origin

@@ -81,33 +81,3 @@ def clip(dom: Domain, o: np.ndarray, d: np.ndarray) -> tuple[float, float]:
                 near = max(near, min(t0, t1))
                 far = min(far, max(t0, t1))
     return near, far
-
-
-@njit(inline="always")
-def blocks_away(distance: np.ndarray, m: float, u0: float, u1: float, u2: float) -> int:
-    """How many blocks away the nearest block with an occupied cell is; m of them along each side."""
-    none, most = np.float32(0), m - np.float32(1)
-    ix, iy, iz = (
-        np.uint32(min(max(u0 * m, none), most)), np.uint32(min(max(u1 * m, none), most)),
-        np.uint32(min(max(u2 * m, none), most)),
-    )  # fmt: skip
-    side = np.uint32(m)
-    return distance[np.uint64(np.uint32(ix + np.uint32(side * np.uint32(iy + np.uint32(side * iz)))))]
-
-
-@njit(inline="always")
-def leave(u: float, inverse: float, n: float, reach: float) -> float:
-    """Distance along the ray at which a coordinate leaves its cell (of n along the axis) and `reach` cells around it.
-
-    `inverse` is 1 / (n direction), large where the ray does not move along the axis; uncontracted space.
-    """
-    place = u * n
-    index = np.floor(place)
-    border = index + np.float32(1) + reach if inverse > 0 else index - reach
-    return (border - place) * np.float32(2) * inverse
-
-
-@njit(inline="always")
-def skip(n: float, reach: float, u0: float, u1: float, u2: float, i0: float, i1: float, i2: float) -> float:
-    """Distance along the ray to the border of the position's cell and `reach` cells around it."""
-    return max(min(leave(u0, i0, n, reach), leave(u1, i1, n, reach), leave(u2, i2, n, reach)), np.float32(0))

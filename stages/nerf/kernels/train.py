@@ -72,7 +72,7 @@ def train(
     `packet` rays are traced together, at most as many as `rays` has room for. The loss is Huber's of the colour
     against `target` (n, 3), already over the ray's `background` (n, 3), times `scale`, plus the distortion loss.
     """
-    size = min(packet, rays.t.shape[0])
+    size = min(packet, rays.opacity.shape[0])
     drgb = np.empty((size, 3), np.float32)
     total = 0
     for start in range(first, last, size):

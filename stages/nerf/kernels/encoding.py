@@ -13,7 +13,7 @@ from numba import njit
 from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.plan import LANES, plan_dense, plan_hashed
 from fieldpose.stages.nerf.kernels.types import Net, Samples
-from fieldpose.stages.nerf.kernels.vectors import BLOCK, WIDTH, blend4, dot4, spread4
+from fieldpose.stages.nerf.kernels.vectors import BLOCK, TOGETHER, WIDTH, blend_one, blend_several, dot4, spread4
 
 U = np.uint64
 U32 = np.uint32
@@ -56,8 +56,11 @@ def encode(net: Net, samples: Samples, first: int, last: int) -> None:
             plan(u, start, count, np.float32(resolutions[level]), masks[level], offsets[level], rows, weights)
             at = start * inputs + level * width
             if width == WIDTH:
-                for s in range(count):
-                    blend4(table, rows, weights, s, x, at + s * inputs)
+                several = count // TOGETHER * TOGETHER
+                for s in range(0, several, TOGETHER):
+                    blend_several(table, rows, weights, s, x, at + s * inputs, inputs)
+                for s in range(several, count):
+                    blend_one(table, rows, weights, s, x, at + s * inputs, inputs)
             else:
                 for s in range(count):
                     for f in range(width):

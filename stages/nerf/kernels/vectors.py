@@ -54,12 +54,29 @@ def vector_at(builder: ir.IRBuilder, data: ir.Value, at: ir.Value, kind: ir.Vect
     return builder.bitcast(builder.gep(data, [at]), kind.as_pointer())
 
 
-def _row(builder: ir.IRBuilder, kind: types.Array, data: ir.Value, row: ir.Value) -> ir.Value:
-    """Row `row` of a table (n, 4) as four float32."""
+def _raw_row(builder: ir.IRBuilder, kind: types.Array, data: ir.Value, row: ir.Value) -> ir.Value:
+    """Row `row` of a table (n, 4) as it is there."""
     half = kind.dtype == types.uint16
     element = ir.VectorType(ir.HalfType() if half else F32, WIDTH)
-    loaded = builder.load(builder.gep(builder.bitcast(data, element.as_pointer()), [row]), align=2 if half else 4)
-    return builder.fpext(loaded, _V4) if half else loaded
+    return builder.load(builder.gep(builder.bitcast(data, element.as_pointer()), [row]), align=2 if half else 4)
+
+
+def _as_floats(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    wide = ir.VectorType(F32, value.type.count)
+    return value if value.type == wide else builder.fpext(value, wide)
+
+
+def _joined(builder: ir.IRBuilder, parts: list[ir.Value]) -> ir.Value:
+    """Vectors of one kind, a power of two of them, one behind the other."""
+    while len(parts) > 1:
+        lanes = ir.Constant(ir.VectorType(I32, 2 * parts[0].type.count), list(range(2 * parts[0].type.count)))
+        parts = [builder.shuffle_vector(a, b, lanes) for a, b in zip(parts[::2], parts[1::2], strict=True)]
+    return parts[0]
+
+
+def _row(builder: ir.IRBuilder, kind: types.Array, data: ir.Value, row: ir.Value) -> ir.Value:
+    """Row `row` of a table (n, 4) as four float32."""
+    return _as_floats(builder, _raw_row(builder, kind, data, row))
 
 
 def _planned(builder: ir.IRBuilder, rows: ir.Value, weights: ir.Value, s: ir.Value, corner: int) -> tuple[Any, Any]:
@@ -69,21 +86,48 @@ def _planned(builder: ir.IRBuilder, rows: ir.Value, weights: ir.Value, s: ir.Val
     return row, in_all_lanes(builder, builder.load(builder.gep(weights, [at])), WIDTH)
 
 
-@intrinsic
-def blend4(typing_context, table, rows, weights, s, x, at):  # type: ignore[no-untyped-def]
-    """x[at:at + 4] (x flat) = sum over the eight corners c of weights[c, s] * table[rows[c, s]]."""
+def _blend(together: int) -> Any:
+    """The intrinsic that encodes so many samples in a level."""
+    kind = ir.VectorType(F32, WIDTH * together)
+    of_lane = ir.Constant(ir.VectorType(I32, WIDTH * together), [i // WIDTH for i in range(WIDTH * together)])
 
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        data = [data_of(context, builder, signature.args[i], arguments[i]) for i in (0, 1, 2, 4)]
-        total = None
-        for corner in range(8):
-            row, weight = _planned(builder, data[1], data[2], arguments[3], corner)
-            part = builder.fmul(weight, _row(builder, signature.args[0], data[0], row), flags=CONTRACT)
-            total = part if total is None else builder.fadd(part, total, flags=CONTRACT)
-        builder.store(total, vector_at(builder, data[3], arguments[5], _V4), align=4)
-        return context.get_dummy_value()
+    @intrinsic
+    def blend(typing_context, table, rows, weights, s, x, at, stride):  # type: ignore[no-untyped-def]
+        """x[at:at + 4] (x flat) = sum over the eight corners c of weights[c, s] * table[rows[c, s]].
 
-    return types.void(table, rows, weights, s, x, at), generate
+        So for each of `together` samples; their places in x are `stride` apart.
+        """
+
+        def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+            data = [data_of(context, builder, signature.args[i], arguments[i]) for i in (0, 1, 2, 4)]
+            several = ir.VectorType(F32, together)
+            total = None
+            for corner in range(8):
+                first = builder.add(arguments[3], ir.Constant(I64, BLOCK * corner))
+                loaded = []
+                for i in range(together):
+                    place = builder.add(first, ir.Constant(I64, i))
+                    row = builder.zext(builder.load(builder.gep(data[1], [place])), I64)
+                    loaded.append(_raw_row(builder, signature.args[0], data[0], row))
+                values = _as_floats(builder, _joined(builder, loaded))
+                weight = builder.load(vector_at(builder, data[2], first, several), align=4)
+                weight = builder.shuffle_vector(weight, ir.Constant(several, ir.Undefined), of_lane)
+                part = builder.fmul(weight, values, flags=CONTRACT)
+                total = part if total is None else builder.fadd(part, total, flags=CONTRACT)
+            for i in range(together):
+                lanes = ir.Constant(ir.VectorType(I32, WIDTH), [WIDTH * i + f for f in range(WIDTH)])
+                part = builder.shuffle_vector(total, ir.Constant(kind, ir.Undefined), lanes)
+                place = builder.add(arguments[5], builder.mul(arguments[6], ir.Constant(I64, i)))
+                builder.store(part, vector_at(builder, data[3], place, _V4), align=4)
+            return context.get_dummy_value()
+
+        return types.void(table, rows, weights, s, x, at, types.int64), generate
+
+    return blend
+
+
+TOGETHER = 4
+blend_one, blend_several = _blend(1), _blend(TOGETHER)
 
 
 @intrinsic

@@ -15,6 +15,7 @@ from numba import njit
 from threadpoolctl import threadpool_limits
 
 from fieldpose.stages.nerf.config import FieldConfig
+from fieldpose.stages.nerf.kernels.layers import layer
 from fieldpose.stages.nerf.kernels.types import SH_SIZE
 
 _ROWS = 256
@@ -26,15 +27,15 @@ _REPEATS = 5
 class Limits:
     """Rates of all cores together.
 
-    `multiply_adds_per_s`: of float32 matrix products as small as a density network's layers; `reads_per_s`: of rows of
-    8 bytes at random places of a table.
+    `multiply_adds_per_s`: of float32 matrix products as small as a density network's layers, by BLAS or by the
+    renderer's own loops, whichever is faster here; `reads_per_s`: of rows of 8 bytes at random places of a table.
     """
 
     multiply_adds_per_s: float
     reads_per_s: float
 
     def seconds(self, config: FieldConfig, samples: int, rays: int) -> float:
-        """The least time for so many samples and rays: the networks' arithmetic and the reads of the hash tables."""
+        """The least time for so many samples, and rays that meet any: the networks' arithmetic and the tables' rows."""
         inputs = config.levels * config.level_features
         density = inputs * config.hidden + config.hidden * (1 + config.features)
         wide = config.colour_hidden
@@ -71,7 +72,7 @@ def _multiply_adds(config: FieldConfig, pool: ThreadPoolExecutor, threads: int) 
     left = np.random.default_rng(0).random((_ROWS, inputs), dtype=np.float32)
     right = np.random.default_rng(1).random((inputs, config.hidden), dtype=np.float32)
     products = 2000
-    best = _best_time(pool, threads, lambda _: _products(left, right, products))
+    best = min(_best_time(pool, threads, lambda _, by=by: by(left, right, products)) for by in (_products, _layers))
     return threads * products * _ROWS * inputs * config.hidden / best
 
 
@@ -95,6 +96,14 @@ def _products(left: np.ndarray, right: np.ndarray, count: int) -> float:
     out = np.empty((left.shape[0], right.shape[1]), np.float32)
     for _ in range(count):
         np.dot(left, right, out)
+    return out[0, 0]
+
+
+@njit(nogil=True)
+def _layers(left: np.ndarray, right: np.ndarray, count: int) -> float:
+    out = np.empty((left.shape[0], right.shape[1]), np.float32)
+    for _ in range(count):
+        layer(left, right, np.float32(-np.inf), np.int64(0), np.int64(left.shape[0]), out)
     return out[0, 0]
 
 

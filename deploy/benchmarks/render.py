@@ -108,6 +108,7 @@ def _at_size(field: Field, limit: machine.Limits, views: list[View]) -> dict[str
                 "ms_per_view": 1e3 * float(np.median([q.seconds for q in quick])),
                 "twin_ms_per_view": 1e3 * slow.seconds,
                 "samples": fast.samples_evaluated / len(quick),
+                "rays_that_meet_any": float(np.count_nonzero(quick[0].view.opacity)),
                 "psnr_db": _psnr(quick[0].view, view, field),
                 "twin_psnr_db": _psnr(slow.view, view, field),
                 "exhaustive_psnr_db": _psnr(_timed(exhaustive, view).view, view, field),
@@ -117,7 +118,7 @@ def _at_size(field: Field, limit: machine.Limits, views: list[View]) -> dict[str
     exhaustive.close()
     mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     camera = views[0].camera
-    least = limit.seconds(field.metadata.config, int(mean["samples"]), camera.width * camera.height)
+    least = limit.seconds(field.metadata.config, int(mean["samples"]), int(mean["rays_that_meet_any"]))
     return mean | {
         "views": len(views),
         "pixels": camera.width * camera.height,

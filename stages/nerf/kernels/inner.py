@@ -9,6 +9,6 @@ from fieldpose.stages.fastmath import FASTMATH
 inner = njit(nogil=True, fastmath=FASTMATH, _nrt=False)
 """For functions that make no arrays of their own, but views of those that they are given.
 
-Otherwise a call counts the references to every array of the named tuples that it is given, some fifty of them, up and down
-by atomic instructions: half a microsecond, as long as four samples take.
+Otherwise a call counts the references to every array of the named tuples that it is given up and down, some fifty of
+them, by atomic instructions: that takes as long as eight samples do.
 """

@@ -28,7 +28,7 @@ def _block(rows: int, columns: int) -> Any:
 
     @intrinsic
     def block(typing_context, x, w, out, row, column, floor):  # type: ignore[no-untyped-def]
-        """out[row:row + rows, column:column + columns] = max(x[row:row + rows] @ w[:, column:column + columns], floor)."""
+        """Of max(x @ w, floor), what is in row..row + rows and column..column + columns of out."""
 
         def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
             given = [context.make_array(signature.args[i])(context, builder, arguments[i]) for i in range(3)]

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numba import njit
 
-from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.ahead import ABREAST, AHEAD, leap, occupied_ahead
+from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.space import clip, occupied, to_cube
 from fieldpose.stages.nerf.kernels.types import BLOCK, Domain, Rays, Samples
 from fieldpose.stages.nerf.kernels.vectors import lowest_bit
@@ -52,7 +52,7 @@ def advance(dom: Domain, count: int, per_ray: int, row: int, rays: Rays, samples
     Samples of a ray lie on t0 + i * step whatever was skipped, so that every way to skip gives the same samples.
     """
     n, m = np.float32(dom.resolution), np.float32(dom.resolution // BLOCK)
-    step, half, zero = np.float32(dom.step), np.float32(0.5), np.float32(0)
+    step, half = np.float32(dom.step), np.float32(0.5)
     contracted, bits, distance, lines = dom.contracted, dom.bits, dom.distance, rays.lines
     capacity = samples.t.shape[0]
     if not contracted:

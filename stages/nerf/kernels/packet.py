@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.encoding import encode
+from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.layers import layer
 from fieldpose.stages.nerf.kernels.march import advance, begin
 from fieldpose.stages.nerf.kernels.types import SH_SIZE, Domain, Net, Rays, Samples
@@ -70,7 +70,7 @@ def log_up_to_two(x: float) -> float:
 
 @njit(inline="always")
 def half_way(before: float, thickness: float) -> float:
-    """Which share of a step of this optical thickness, before which `before` >= 0.5 of the light is left, leaves 0.5."""
+    """Which share of a step of this optical thickness leaves half of all light, if at least that reaches the step."""
     to_half = log_up_to_two(before / HALF)
     return to_half / min(thickness, to_half + HALF_TO_SMALLEST)
 

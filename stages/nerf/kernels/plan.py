@@ -11,7 +11,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from fieldpose.stages.nerf.kernels.vectors import BLOCK, CONTRACT, F32, I32, I64, data_of, in_all_lanes, vector_at
+from fieldpose.stages.nerf.kernels.vectors import BLOCK, F32, I32, I64, data_of, in_all_lanes, vector_at
 
 LANES = 16
 PRIME_Y, PRIME_Z = 2654435761, 805459861
@@ -49,10 +49,8 @@ def _store(builder: ir.IRBuilder, values: list[ir.Value], data: ir.Value, k: ir.
 def _weights(builder: ir.IRBuilder, cells: list[Any]) -> list[ir.Value]:
     """Trilinear weights of the eight corners, x fastest."""
     (_, *xs), (_, *ys), (_, *zs) = cells
-    return [
-        builder.fmul(xs[1 - (c & 1)], builder.fmul(ys[1 - (c >> 1 & 1)], zs[1 - (c >> 2)], flags=CONTRACT), flags=CONTRACT)
-        for c in range(8)
-    ]
+    flat = [builder.fmul(ys[1 - (c & 1)], zs[1 - (c >> 1)]) for c in range(4)]
+    return [builder.fmul(xs[1 - (c & 1)], flat[c >> 1]) for c in range(8)]
 
 
 @intrinsic

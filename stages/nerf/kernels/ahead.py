@@ -105,7 +105,8 @@ def leap(typing_context, bits, distance, cells, blocks, step, lines, t, far, ali
         floats, bytes_ = ir.VectorType(F32, lanes), ir.VectorType(ir.IntType(8), lanes)
         bits, table, times, ends, flags = (data_of(context, builder, kinds[i], arguments[i]) for i in (0, 1, 6, 7, 8))
         fine, coarse, step = (in_all_lanes(builder, arguments[i], lanes) for i in (2, 3, 4))
-        per_block = builder.fdiv(fine, coarse)
+        of_blocks = builder.fdiv(_every(2, lanes), step)
+        of_cells = builder.fdiv(builder.fmul(of_blocks, coarse), fine)
         lines = context.make_array(kinds[5])(context, builder, arguments[5])
         stride = builder.extract_value(lines.shape, 1)
         starts = [builder.add(at, builder.mul(stride, ir.Constant(I64, i))) for i in range(9)]
@@ -136,7 +137,6 @@ def leap(typing_context, bits, distance, cells, blocks, step, lines, t, far, ali
 
         builder.position_at_end(move)
         reach = builder.select(empty, builder.fsub(builder.sitofp(away, floats), _every(1, lanes)), _every(0, lanes))
-        scale = builder.select(empty, _every(2, lanes), builder.fdiv(_every(2, lanes), per_block))
         free = None
         for block, cell, inverse in zip(of_block, of_cell, ways[6:], strict=True):
             place = builder.select(empty, block, cell)
@@ -145,8 +145,8 @@ def leap(typing_context, bits, distance, cells, blocks, step, lines, t, far, ali
             border = builder.select(builder.fcmp_ordered(">", inverse, _every(0, lanes)), high, low)
             along = builder.fmul(builder.fsub(border, place), inverse)
             free = along if free is None else _least(builder, free, along)
-        free = builder.fmul(free, scale)
-        steps = _most(builder, _rounded(builder, "ceil", builder.fdiv(free, step)), _every(1, lanes))
+        free = builder.fmul(free, builder.select(empty, of_blocks, of_cells))
+        steps = _most(builder, _rounded(builder, "ceil", free), _every(1, lanes))
         later = builder.fadd(now, builder.fmul(step, steps, flags=CONTRACT), flags=CONTRACT)
         now.add_incoming(builder.select(going, later, now), builder.block)
         builder.branch(look)

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.packet import MAX_EXPONENT
 from fieldpose.stages.nerf.kernels.types import Net, Rays, Samples
 
@@ -15,7 +16,7 @@ FEW = 8
 """Moving the rows costs about as much as the backward pass of an eighth of them."""
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def mask_relu(gradient: np.ndarray, activation: np.ndarray) -> None:
     for i in range(gradient.shape[0]):
         for j in range(gradient.shape[1]):
@@ -23,7 +24,7 @@ def mask_relu(gradient: np.ndarray, activation: np.ndarray) -> None:
                 gradient[i, j] = 0
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def shade_backward(rays: Rays, r: int, background: np.ndarray, drgb: np.ndarray) -> None:
     """Seed the gradients of a ray's composited values from that of its colour, drgb (3,)."""
     o = rays.opacity[r]
@@ -57,7 +58,7 @@ def spread_coordinate(contracted: bool, t: float) -> float:
     return t / (np.float32(1) + t) if contracted else t
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def composite_backward(samples: Samples, rays: Rays, count: int, distortion: float, contracted: bool) -> None:
     """Fill samples.dout from the gradients of the composited values.
 

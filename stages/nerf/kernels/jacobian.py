@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from fieldpose.stages.fastmath import FASTMATH
 from fieldpose.stages.kernel_cache import cached_njit
@@ -15,12 +14,13 @@ from fieldpose.stages.nerf.kernels.backward import (
     shade_backward,
 )
 from fieldpose.stages.nerf.kernels.encoding import position_gradients
+from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.packet import forward, shade, surface
 from fieldpose.stages.nerf.kernels.space import cube_gradient
 from fieldpose.stages.nerf.kernels.types import SH_SIZE, Domain, Net, Rays, Samples
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def harmonics_gradient(d: np.ndarray, g: np.ndarray, at: int, out: np.ndarray) -> None:
     """Add to out (3,) the gradient with respect to the unit direction of the harmonics with gradient g[at:at + 16]."""
     x, y, z = d[0], d[1], d[2]
@@ -44,7 +44,7 @@ def harmonics_gradient(d: np.ndarray, g: np.ndarray, at: int, out: np.ndarray) -
     )  # fmt: skip
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def ray_gradients(
     net: Net,
     contracted: bool,
@@ -55,11 +55,14 @@ def ray_gradients(
     samples: Samples,
     rays: Rays,
     du: np.ndarray,
+    dy: np.ndarray,
     jacobian: np.ndarray,
     k: int,
 ) -> None:
-    """Add up the samples' gradients into jacobian[start:start + count, k]: origin, then unit direction."""
-    dy = np.empty(3, np.float32)
+    """Add up the samples' gradients into jacobian[start:start + count, k]: origin, then unit direction.
+
+    du (3, rows) and dy (3,) are scratch.
+    """
     features = rays.feats.shape[1] - SH_SIZE
     for r in range(count):
         harmonics_gradient(directions[start + r], rays.dfeats[r], features, jacobian[start + r, k, 3:])
@@ -98,7 +101,7 @@ def render_jacobian(
     """
     size = rays.opacity.shape[0]
     drgb = np.empty((size, 3), np.float32)
-    du = np.empty((3, samples.t.shape[0]), np.float32)
+    du, dy = np.empty((3, samples.t.shape[0]), np.float32), np.empty(3, np.float32)
     for start in range(first, last, size):
         count = min(size, last - start)
         rows, _ = forward(
@@ -119,4 +122,4 @@ def render_jacobian(
             composite_backward(samples, rays, count, 0.0, dom.contracted)
             if rows > 0:
                 density_backward(net, samples, rows)
-            ray_gradients(net, dom.contracted, directions, start, count, rows, samples, rays, du, jacobian, k)
+            ray_gradients(net, dom.contracted, directions, start, count, rows, samples, rays, du, dy, jacobian, k)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from fieldpose.stages.fastmath import FASTMATH
+from fieldpose.stages.nerf.kernels.inner import inner
 from fieldpose.stages.nerf.kernels.types import BLOCK, Domain
 
 
@@ -29,7 +29,7 @@ def to_cube(contracted: bool, y0: float, y1: float, y2: float) -> tuple[float, f
     return y0 * scale + half, y1 * scale + half, y2 * scale + half, max(r, np.float32(1))
 
 
-@njit(nogil=True, fastmath=FASTMATH)
+@inner
 def cube_gradient(contracted: bool, y: np.ndarray, du: np.ndarray, dy: np.ndarray) -> None:
     """Pull the gradient du (3,) with respect to the cube back to normalised coordinates, into dy (3,)."""
     if not contracted:

@@ -42,7 +42,8 @@ def test_kernels_use_nothing_that_their_cache_does_not_know(package: Any) -> Non
         tree = ast.parse(Path(kernel.py_func.__code__.co_filename).read_text())
         imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
         origin = {alias.asname or alias.name: node.module or "" for node in imports for alias in node.names}
-        defined = next(node for node in tree.body if getattr(node, "name", None) == kernel.py_func.__name__)
+        functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+        defined = next(function for function in functions if function.name == kernel.py_func.__name__)
         used = {origin.get(node.id, "") for node in ast.walk(defined) if isinstance(node, ast.Name)}
         ours = {module for module in used if module.startswith("fieldpose")}
         assert all(module in KNOWN or module.startswith(package.__name__) for module in ours), ours

@@ -1,4 +1,4 @@
-"""Four features at a time: a table row is one vector register, which the compiler does not find by itself.
+"""Vectors that the compiler does not find by itself: a table's row is one of four features.
 
 Tables are float32, or the bits of float16 as uint16, which are read as such and computed with as float32.
 """
@@ -14,7 +14,9 @@ from numba.extending import intrinsic
 
 WIDTH = 4
 COLUMNS = 16
-"""Of what layers of networks compute at once."""
+"""Of a layer of a network, that are computed at once."""
+TOGETHER = 4
+"""Samples that are encoded at once."""
 BLOCK = 64
 """Samples that a plan is made for at once; see `encoding.plan`."""
 
@@ -62,6 +64,7 @@ def _raw_row(builder: ir.IRBuilder, kind: types.Array, data: ir.Value, row: ir.V
 
 
 def _as_floats(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    """A vector of float16 or float32 as float32."""
     wide = ir.VectorType(F32, value.type.count)
     return value if value.type == wide else builder.fpext(value, wide)
 
@@ -126,7 +129,6 @@ def _blend(together: int) -> Any:
     return blend
 
 
-TOGETHER = 4
 blend_one, blend_several = _blend(1), _blend(TOGETHER)
 
 

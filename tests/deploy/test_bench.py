@@ -21,6 +21,7 @@ from fieldpose.deploy.cli import main
 from fieldpose.stages.geometry import points_at_depth
 from fieldpose.stages.matching.core import MatchedPixels
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
+from fieldpose.stages.nerf.field import Field, load_field
 from fieldpose.stages.nerf.from_dataset import train_field
 
 SMALL = FieldConfig(levels=2, log2_table=8, hidden=8, colour_hidden=8, occupancy_resolution=16, finest_resolution=32)
@@ -53,6 +54,8 @@ def one_core(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_rendering_is_measured_at_each_size(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     field, figures = tmp_path / "field.safetensors", tmp_path / "render.json"
     train_field(dataset, field, 32, training=TrainingConfig(steps=20), config=SMALL)
+    learnt = load_field(field)
+    Field(learnt.metadata, learnt.net, np.ones_like(learnt.occupied)).save(field)
     arguments = ["--dataset", dataset, "--field", field, "--sizes", 16, 32, "--views", 1, "--out", tmp_path / "plots"]
     assert main(["bench", "render", *map(str, arguments), "--json", str(figures)]) == 0
     written = json.loads(figures.read_text())

@@ -72,8 +72,11 @@ def _multiply_adds(config: FieldConfig, pool: ThreadPoolExecutor, threads: int) 
     left = np.random.default_rng(0).random((_ROWS, inputs), dtype=np.float32)
     right = np.random.default_rng(1).random((inputs, config.hidden), dtype=np.float32)
     products = 2000
-    best = min(_best_time(pool, threads, lambda _, by=by: by(left, right, products)) for by in (_products, _layers))
-    return threads * products * _ROWS * inputs * config.hidden / best
+
+    def best(by: Callable[[np.ndarray, np.ndarray, int], float]) -> float:
+        return _best_time(pool, threads, lambda _: by(left, right, products))
+
+    return threads * products * _ROWS * inputs * config.hidden / min(best(_products), best(_layers))
 
 
 def _reads(table_rows: int, pool: ThreadPoolExecutor, threads: int) -> float:

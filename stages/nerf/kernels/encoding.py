@@ -1,8 +1,8 @@
 """Multiresolution hash encoding (Müller et al., "Instant Neural Graphics Primitives", 2022): forward and backward.
 
-A plan (table rows and weights of the corners) is made for a block of samples at once, in loops over samples that the
-compiler turns into vector instructions; then the features of each sample are gathered, four in one register. Table rows
-are unsigned: numba then drops its test for negative indices from the innermost loops.
+A plan (table rows and weights of the corners) is made for a block of samples at once; then their features are gathered,
+those of several samples in one register. Table rows are unsigned: numba then drops its test for negative indices from
+the innermost loops.
 """
 
 from __future__ import annotations

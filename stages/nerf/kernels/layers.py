@@ -32,13 +32,13 @@ def _block(rows: int, columns: int) -> Any:
 
         def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
             given = [context.make_array(signature.args[i])(context, builder, arguments[i]) for i in range(3)]
-            inner, width = (builder.extract_value(given[i].shape, 1) for i in (0, 1))
+            depth, width = (builder.extract_value(given[i].shape, 1) for i in (0, 1))
             lines = [builder.add(arguments[3], ir.Constant(I64, r)) for r in range(rows)]
-            reads = [builder.gep(given[0].data, [builder.mul(line, inner)]) for line in lines]
+            reads = [builder.gep(given[0].data, [builder.mul(line, depth)]) for line in lines]
             sums = [cgutils.alloca_once(builder, vector) for _ in range(rows)]
             for total in sums:
                 builder.store(none, total)
-            with cgutils.for_range(builder, inner) as loop:
+            with cgutils.for_range(builder, depth) as loop:
                 at = builder.add(builder.mul(loop.index, width), arguments[4])
                 weights = builder.load(vector_at(builder, given[1].data, at, vector), align=4)
                 for read, total in zip(reads, sums, strict=True):

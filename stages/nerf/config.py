@@ -52,7 +52,7 @@ class TrainingConfig:
     on the CPU, for comparison."""
     seed: int = 0
     samples_per_step: int = 1 << 15
-    """Rays are added to a step until they carry about so many samples."""
+    """Rays are added to a step until they carry about so many samples, in the end three times as many."""
     learning_rate: float = 1e-2
     final_learning_rate: float = 5e-4
     distortion: float | None = None

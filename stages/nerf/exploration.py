@@ -26,7 +26,7 @@ LEAST_ERROR = 0.01
 WORSE = 3.0
 """How many times the mean error is."""
 MOST = 0.02
-"""Share of all cells that may be looked at again at once, where fewer than that are occupied."""
+"""Share of the empty cells that may be looked at again at once: with half of a room's, haze came back and stayed."""
 EARLY, EARLY_EVERY, EVERY = 2048, 512, 2048
 UNTIL = 0.9
 
@@ -43,10 +43,10 @@ def due(step: int, fraction: float) -> bool:
     return step > 0 and step % (EARLY_EVERY if step <= EARLY else EVERY) == 0 and fraction < UNTIL
 
 
-def missing(blocks: Blocks, space: Space, empty: np.ndarray, occupied: int) -> np.ndarray:
-    """Flat cells of `empty`, (n, n, n) bool, that most views which see them are wrong at; `occupied`: how many are."""
+def missing(blocks: Blocks, space: Space, empty: np.ndarray) -> np.ndarray:
+    """Flat cells of `empty`, (n, n, n) bool, that most views which see them are wrong at."""
     limit = max(LEAST_ERROR, WORSE * blocks.mean_error)
-    most = max(occupied, MOST * empty.sum())
+    most = MOST * empty.sum()
     while True:
         found = np.flatnonzero(hull(blocks.wrong(limit), space, empty, MISSED, MISSED_BY))
         if len(found) <= most:

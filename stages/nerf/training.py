@@ -135,7 +135,7 @@ class Learner(ABC):
         """Have cells marched through, until this is called again, where the images show what the field does not."""
         occupancy = self._occupancy
         empty = occupancy.allowed & ~occupancy.occupied
-        occupancy.hold(missing(self._bank.blocks, self.space, empty, int(occupancy.occupied.sum())))
+        occupancy.hold(missing(self._bank.blocks, self.space, empty))
         self.occupancy_changed(occupancy.occupied)
 
     def _adapt(self, samples_per_ray: float) -> None:

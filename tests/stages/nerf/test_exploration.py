@@ -12,7 +12,7 @@ from fieldpose.stages.geometry import Camera, camera_centre, look_at
 from fieldpose.stages.nerf import training
 from fieldpose.stages.nerf.blocks import SIDE, Blocks, View
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
-from fieldpose.stages.nerf.exploration import due
+from fieldpose.stages.nerf.exploration import due, missing
 from fieldpose.stages.nerf.hull import BEHIND, SLACK_PX, Marked, hull, seen_in
 from fieldpose.stages.nerf.metadata import FieldMetadata, Space
 from fieldpose.stages.nerf.occupancy import cell_positions, cell_radii, from_cube
@@ -174,6 +174,19 @@ def test_blocks_without_an_allowed_cell_are_not_drawn_from() -> None:
     grown = np.stack(seen).reshape(3, -1)
     assert drawn[grown].all()
     assert drawn.mean() < 0.5
+
+
+def test_few_cells_are_looked_at_again_at_once_those_that_are_most_wrong() -> None:
+    poses, image = around(12, 4.0, 5), np.zeros((44, 60, 3), np.uint8)
+    blocks = Blocks([View(f"{i}", image, CAMERA, pose) for i, pose in enumerate(poses)], SPACE)
+    error = blocks.error.reshape(12, 11, 15)
+    error[:, 2:-2, 4:-4] = 1.0
+    error[:, 5, 7] = 5.0
+    empty = np.ones((32, 32, 32), bool)
+    assert hull(blocks.wrong(0.9), SPACE, empty, 0.3, 3).mean() > 0.02
+    found = missing(blocks, SPACE, empty)
+    assert 0 < len(found) <= 0.02 * empty.size
+    assert np.linalg.norm(centres(SPACE, 32)[found] - SPACE.centre, axis=1).max() < 0.7
 
 
 def test_looks_come_often_at_first_and_end_before_the_training_does() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shutil
 import socket
@@ -17,6 +16,7 @@ from typing import Literal
 import psutil
 
 from fieldpose.errors import FieldposeError
+from fieldpose.stages.cores import usable_cores
 
 _PACKAGES = ("torch", "kornia", "numba", "numpy", "opencv-python-headless", "eclipse-zenoh", "mcap", "supervisor")
 _SHARED_MEMORY = Path("/dev/shm")
@@ -43,7 +43,7 @@ Check = Callable[[], Iterator[Finding]]
 
 def machine() -> Iterator[Finding]:
     """Processor and memory."""
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     text = f"{platform.system()} {platform.machine()}, {cores} cores"
     yield Finding(
         "machine", "ok" if cores > 1 else "warning", text, "" if cores > 1 else "two cores or more are faster"

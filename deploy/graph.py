@@ -10,7 +10,6 @@ back.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,6 +43,7 @@ from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan
 from fieldpose.errors import ConfigError, UsageError
 from fieldpose.stages.camera.sources import EXTERNAL, knows_truth
+from fieldpose.stages.cores import usable_cores
 
 HUB, RECORDER, CAMERA = "hub", "recorder", "camera"
 OBSERVER = "observer"
@@ -223,7 +223,7 @@ def rows_of(plan: Plan, recorded: bool) -> list[Process]:
 
 def threads_of(row: Process, depth: int, cores: int | None = None) -> int:
     """A process's budget: with `depth` frames in flight as many processes are at work at once."""
-    cores = cores or len(os.sched_getaffinity(0))
+    cores = cores or usable_cores()
     return max(1, cores // min(depth, cores)) if row.parallel else 1
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from threadpoolctl import threadpool_limits
 
+from fieldpose.stages.cores import usable_cores
 from fieldpose.stages.nerf.config import FieldConfig
 from fieldpose.stages.nerf.kernels.layers import layer
 from fieldpose.stages.nerf.kernels.types import SH_SIZE
@@ -53,7 +54,7 @@ def limits(config: FieldConfig, table_rows: int) -> Limits:
 
 def cores() -> int:
     """Cores that this process may use."""
-    return len(os.sched_getaffinity(0))
+    return usable_cores()
 
 
 def describe() -> str:

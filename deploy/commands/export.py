@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from fieldpose.deploy.reporting.output import write_bytes
 from fieldpose.deploy.reporting.surfaces import check_surface, glb, ply
 from fieldpose.deploy.reporting.turntable import check_video, write_turntable
 from fieldpose.errors import FieldFileError, UsageError
+from fieldpose.stages.cores import usable_cores
 from fieldpose.stages.nerf.metadata import FieldMetadata
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ class Options:
                 yield "--region: expected the lowest corner, then the highest, each as x y z"
 
     def _threads(self) -> int:
-        return self.threads or os.cpu_count() or 1
+        return self.threads or usable_cores()
 
     def _surface(self, renderer: RayRenderer, metadata: FieldMetadata) -> None:
         from fieldpose.stages.nerf.surface.extract import Region, region_of, seen_surface, surface_mesh, surface_points

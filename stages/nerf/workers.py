@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from threading import Lock
 
 import numpy as np
 
+from fieldpose.stages.cores import usable_cores
 from fieldpose.stages.nerf.blas import SingleThreadedBlas
 from fieldpose.stages.nerf.config import FieldConfig
 from fieldpose.stages.nerf.kernels.ahead import ABREAST
@@ -97,7 +97,7 @@ class Workers:
     """
 
     def __init__(self, config: FieldConfig, threads: int, packet: int, rows: int, backward: bool):
-        self.threads = threads or os.cpu_count() or 1
+        self.threads = threads or usable_cores()
         self._release_blas = BLAS.hold(self)
         self._pool = ThreadPoolExecutor(self.threads) if self.threads > 1 else None
         self.scratch = [

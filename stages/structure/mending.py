@@ -6,7 +6,6 @@ cameras and by the adjusted ones, and whichever leaves it nearer to its pixels h
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from fieldpose.errors import GeometryError
+from fieldpose.stages.cores import usable_cores
 from fieldpose.stages.geometry import camera_centres, rotation_error_deg
 from fieldpose.stages.geometry.arrays import Flags, Values
 from fieldpose.stages.structure.adjustment import MEDIAN_LENGTH, adjust, supported
@@ -99,7 +99,7 @@ def mend(
     all cores. report: is told what is done and its share.
     """
     small = PosedCameras(tuple(camera.shrunk(LONGER_SIDE) for camera in given.cameras), given.cam_from_object)
-    threads = threads or len(os.sched_getaffinity(0))
+    threads = threads or usable_cores()
     tracks = find_tracks(small, load, threads, report)
     report("adjusting the cameras", 0.0)
     trained_px = trained_px or _longest(given)

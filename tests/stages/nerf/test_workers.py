@@ -1,3 +1,4 @@
+import os
 from collections.abc import Iterator
 
 import numpy as np
@@ -47,3 +48,12 @@ def test_workers_that_nobody_closes_give_blas_back_as_well() -> None:
     assert blas_threads() == {1}
     del kept
     assert blas_threads() == {2}
+
+
+def test_as_many_threads_as_the_process_may_use_cores() -> None:
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(before)})
+    try:
+        assert Workers(FieldConfig(), 0, 8, 16, backward=False).threads == 1
+    finally:
+        os.sched_setaffinity(0, before)

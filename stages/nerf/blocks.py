@@ -80,10 +80,16 @@ class Blocks:
         self.error[block] = REMEMBERED * self.error[block] + np.float32(1 - REMEMBERED) * errors
         self.depth[block] = depths
 
-    def wrong(self, limit: float) -> list[Marked]:
-        """The views with a block as a pixel, those marked whose error is above the limit."""
+    @property
+    def views(self) -> int:
+        """How many there are."""
+        return len(self._views)
+
+    def wrong(self, limit: float, views: np.ndarray) -> list[Marked]:
+        """Some of the views with a block as a pixel, those marked whose error is above the limit."""
         result = []
-        for i, view in enumerate(self._views):
+        for i in views:
+            view = self._views[i]
             part, shape = slice(self._starts[i], self._starts[i + 1]), tuple(self._grid[i])
             depth = (self.depth[part] * np.float32(self._scale)).reshape(shape)
             result.append(

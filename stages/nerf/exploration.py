@@ -27,7 +27,11 @@ WORSE = 3.0
 """How many times the mean error is."""
 MOST = 0.02
 """Share of the empty cells that may be looked at again at once: with half of a room's, haze came back and stayed."""
-EARLY, EARLY_EVERY, EVERY = 2048, 512, 2048
+HIGHER = 1.4
+"""By how much an error is to be larger where that many cells are too many; of twice, a room's wires were lost."""
+ASKED = 48
+"""So many views, at most, are asked each time, others the next: a look then takes a second or two."""
+EARLY, EARLY_EVERY, EVERY = 2048, 512, 1024
 UNTIL = 0.9
 
 
@@ -43,12 +47,13 @@ def due(step: int, fraction: float) -> bool:
     return step > 0 and step % (EARLY_EVERY if step <= EARLY else EVERY) == 0 and fraction < UNTIL
 
 
-def missing(blocks: Blocks, space: Space, empty: np.ndarray) -> np.ndarray:
-    """Flat cells of `empty`, (n, n, n) bool, that most views which see them are wrong at."""
+def missing(blocks: Blocks, space: Space, empty: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Flat cells of `empty`, (n, n, n) bool, that most of the views which see them are wrong at; some are asked."""
     limit = max(LEAST_ERROR, WORSE * blocks.mean_error)
+    asked = np.sort(rng.permutation(blocks.views)[:ASKED])
     most = MOST * empty.sum()
     while True:
-        found = np.flatnonzero(hull(blocks.wrong(limit), space, empty, MISSED, MISSED_BY))
+        found = np.flatnonzero(hull(blocks.wrong(limit, asked), space, empty, MISSED, MISSED_BY))
         if len(found) <= most:
             return found
-        limit *= 2
+        limit *= HIGHER

@@ -118,6 +118,11 @@ class OccupancyEstimate:
         self._held = cells
         self._decide()
 
+    @property
+    def empty(self) -> np.ndarray:
+        """(n, n, n) bool: allowed cells that are marched through only because they are held, or not at all."""
+        return self.allowed & ~self._dense().reshape(self.allowed.shape)
+
     def update(self, densities: Callable[[np.ndarray], np.ndarray], fraction: float, decay: float = 0.95) -> None:
         """Look at a random `fraction` of the cells and at as many of the occupied ones; then decide anew."""
         count = max(1, int(len(self._candidates) * fraction))
@@ -134,10 +139,13 @@ class OccupancyEstimate:
 
     def _decide(self) -> None:
         """A cell is occupied where a step through it is opaque enough, or more opaque than the mean is."""
-        mean = float(self._estimate.sum(dtype=np.float64)) / max(len(self._candidates), 1)
-        occupied = self._estimate > min(LEAST_OPACITY / self.space.step, mean)
+        occupied = self._dense()
         occupied[self._held] = True
         self.occupied = occupied.reshape(self.allowed.shape)
+
+    def _dense(self) -> np.ndarray:
+        mean = float(self._estimate.sum(dtype=np.float64)) / max(len(self._candidates), 1)
+        return self._estimate > min(LEAST_OPACITY / self.space.step, mean)
 
     def _some(self, cells: np.ndarray, count: int) -> np.ndarray:
         """Random ones, some of them perhaps twice: drawing without repeats would sort millions of cells."""

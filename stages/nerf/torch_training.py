@@ -55,7 +55,7 @@ class TorchTrainer(Learner):
         )
         with torch.no_grad():
             samples = self._twin.march(origins, directions, self._tensor(jitter))
-        rays = self._twin(origins, directions, background, samples, float(self.reach))
+        rays = self._twin(origins, directions, background, samples)
         loss = huber_loss(rays.rgb, target, reduction="sum", delta=self.config.huber_delta)
         loss = loss + self.distortion * distortion_loss(samples, rays.weights, self.space.contracted)
         self._adam.zero_grad()

@@ -137,21 +137,13 @@ class TwinField(nn.Module):
         high = torch.where(parallel, torch.where(inside, infinite, -infinite), torch.maximum(first, second))
         return torch.maximum(near, low.amax(1)), torch.minimum(far, high.amin(1))
 
-    def forward(
-        self, origins: Tensor, directions: Tensor, background: Tensor, samples: TwinSamples, reach: float = 0.0
-    ) -> TwinRays:
-        """Composite (paper eq. 2 and 3) and shade; gradients flow to parameters, origins and directions.
-
-        Those of samples nearer than `reach` are weakened, see kernels.train.damp_near.
-        """
+    def forward(self, origins: Tensor, directions: Tensor, background: Tensor, samples: TwinSamples) -> TwinRays:
+        """Composite (paper eq. 2 and 3) and shade; gradients flow to parameters, origins and directions."""
         positions = origins[:, None] + samples.t[..., None] * directions[:, None]
         out = origins.new_zeros(*samples.t.shape, self.w2.shape[1])
         if bool(samples.valid.any()):
             u, _ = self.to_cube(positions[samples.valid])
             out = out.index_put((samples.valid.nonzero(as_tuple=True)), self.density_network(u))
-        if reach > 0:
-            share = (samples.t / reach).clamp(max=1)[..., None] ** 2
-            out = share * out + (1 - share) * out.detach()
         sigma = out[..., 0].clamp(max=float(MAX_EXPONENT)).exp() * samples.valid
         passed = torch.cumsum(sigma * samples.dt, dim=1)
         after = torch.exp(-passed)

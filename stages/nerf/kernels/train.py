@@ -44,20 +44,6 @@ def accumulate(net: Net, samples: Samples, rays: Rays, rows: int, count: int, gr
         scatter(net, samples, np.int64(0), rows, grads.table)
 
 
-@njit(nogil=True, fastmath=FASTMATH)
-def damp_near(samples: Samples, rows: int, reach: float) -> None:
-    """Weaken gradients of samples nearer than `reach` by how many more rays meet a piece of space there.
-
-    Rays of a camera are the closer together the nearer to it, and learnt from alike, a haze before its lens explains
-    its image (Philip and Deschaintre, "Floaters No More", 2023).
-    """
-    for s in range(rows):
-        if samples.t[s] < reach:
-            share = samples.t[s] / reach
-            for f in range(samples.dout.shape[1]):
-                samples.dout[s, f] *= share * share
-
-
 @cached_njit(nogil=True, fastmath=FASTMATH)
 def train(
     net: Net,
@@ -74,7 +60,6 @@ def train(
     stop_below: float,
     huber_delta: float,
     distortion: float,
-    reach: float,
     scale: float,
     samples: Samples,
     rays: Rays,
@@ -85,8 +70,7 @@ def train(
     """Add the gradients of rays first..last, fill their squared errors and depths; return the samples evaluated.
 
     `packet` rays are traced together, at most as many as `rays` has room for. The loss is Huber's of the colour
-    against `target` (n, 3), already over the ray's `background` (n, 3), times `scale`, plus the distortion loss; see
-    damp_near for `reach`.
+    against `target` (n, 3), already over the ray's `background` (n, 3), times `scale`, plus the distortion loss.
     """
     size = min(packet, rays.opacity.shape[0])
     drgb = np.empty((size, 3), np.float32)
@@ -108,7 +92,6 @@ def train(
             shade_backward(rays, r, background[start + r], drgb[r])
         colour_backward(net, rays, count, drgb)
         composite_backward(samples, rays, count, distortion * scale, dom.contracted)
-        damp_near(samples, rows, reach)
         if rows > 0:
             density_backward(net, samples, rows)
         accumulate(net, samples, rays, rows, count, grads)

@@ -15,7 +15,7 @@ from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.exploration import due, missing
 from fieldpose.stages.nerf.hull import BEHIND, SLACK_PX, Marked, hull, seen_in
 from fieldpose.stages.nerf.metadata import FieldMetadata, Space
-from fieldpose.stages.nerf.occupancy import cell_positions, cell_radii, from_cube
+from fieldpose.stages.nerf.occupancy import OccupancyEstimate, cell_positions, cell_radii, from_cube
 from fieldpose.stages.nerf.renderer import NumbaRenderer
 from fieldpose.stages.nerf.training import Trainer
 
@@ -152,12 +152,13 @@ def test_errors_are_remembered_and_marked_where_they_were_seen() -> None:
     blocks = Blocks(plain_views(((8, 8), (8, 12))), SPACE)
     for _ in range(30):
         blocks.learnt(np.array([1, 6]), np.array([0.5, 0.02], np.float32), np.array([2.0, 3.0], np.float32))
-    first, second = blocks.wrong(0.1)
+    first, second = blocks.wrong(0.1, np.arange(2))
     assert np.array_equal(first.pixels, [[False, True], [False, False]])
     assert not second.pixels.any()
     assert first.depth is not None
     assert first.depth[0, 1] == pytest.approx(2.0 * SPACE.scale)
-    assert blocks.wrong(0.01)[1].pixels.sum() == 1
+    (second,) = blocks.wrong(0.01, np.array([1]))
+    assert second.pixels.sum() == 1
     assert (second.camera.width, second.camera.height, second.camera.fx) == (3, 2, 50.0 / SIDE)
 
 
@@ -183,15 +184,28 @@ def test_few_cells_are_looked_at_again_at_once_those_that_are_most_wrong() -> No
     error[:, 2:-2, 4:-4] = 1.0
     error[:, 5, 7] = 5.0
     empty = np.ones((32, 32, 32), bool)
-    assert hull(blocks.wrong(0.9), SPACE, empty, 0.3, 3).mean() > 0.02
-    found = missing(blocks, SPACE, empty)
+    assert hull(blocks.wrong(0.9, np.arange(12)), SPACE, empty, 0.3, 3).mean() > 0.02
+    found = missing(blocks, SPACE, empty, np.random.default_rng(0))
     assert 0 < len(found) <= 0.02 * empty.size
     assert np.linalg.norm(centres(SPACE, 32)[found] - SPACE.centre, axis=1).max() < 0.7
 
 
+def test_a_cell_that_is_held_counts_as_empty_until_it_is_dense() -> None:
+    allowed = np.ones((8, 8, 8), bool)
+    allowed[0] = False
+    estimate = OccupancyEstimate(SPACE, 8, allowed, np.random.default_rng(0))
+    dense = np.zeros(512, bool)
+    dense[100] = True
+    estimate.update(lambda u: np.where((u * 8).astype(int) @ [1, 8, 64] == 100, 1e3, 0).astype(np.float32), 1.0)
+    assert np.array_equal(np.flatnonzero(estimate.occupied), [100])
+    estimate.hold(np.array([100, 200]))
+    assert np.array_equal(np.flatnonzero(estimate.occupied), [100, 200])
+    assert np.array_equal(estimate.empty.ravel(), allowed.ravel() & ~dense)
+
+
 def test_looks_come_often_at_first_and_end_before_the_training_does() -> None:
     steps = [s for s in range(10_000) if due(s, s / 10_000)]
-    assert steps == [512, 1024, 1536, 2048, 4096, 6144, 8192]
+    assert steps == [512, 1024, 1536, *range(2048, 9000, 1024)]
 
 
 SMALL = FieldConfig(

@@ -6,6 +6,7 @@ Sources: Fischler and Bolles, Random sample consensus (1981); Chum, Matas and Ki
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -92,29 +93,36 @@ def confirmed_pose(
     weights: Values,
     aligner: Aligner,
     config: PnpConfig,
+    contradicted: Callable[[Transform], bool],
 ) -> Consensus | None:
     """Of the poses that matches agree on, the one at which the most points are found in the frame.
 
     points: those of the matches, whose pixels and weights are given, then landmarks, which no match has chosen. The
     first pose is it if many landmarks are found. If not, the matches that agreed so far are left out, for others to
     agree on another pose, as they do where the object has parts that look alike. If too little is found at each, it is
-    the first after all, if enough matches agree on it, else None.
+    the first after all, if enough matches agree on it, else None. A pose that is contradicted is none of these.
     """
     count = len(pixels_in_frame)
     marks = len(points) - count
     search = replace(config, min_inlier_ratio=config.min_inlier_ratio * constants.UNCONFIRMED_SHARE)
     left, best, first, most, needed = np.arange(count), None, None, 0, 0.0
-    for _ in range(constants.ATTEMPTS):
+    attempts, contradictions = 0, 0
+    while attempts < constants.ATTEMPTS and contradictions < constants.CONTRADICTIONS:
         agreed = agreed_pose(pixels_in_frame[left], points[left], camera, weights[left], search)
         if agreed is None:
             break
-        others = np.delete(left, agreed.index)
-        agreed = replace(agreed, index=left[agreed.index], matched=count, marks=marks)
+        agreed, left = (
+            replace(agreed, index=left[agreed.index], matched=count, marks=marks), np.delete(left, agreed.index),
+        )  # fmt: skip
         found, most = _aligned(agreed, aligner, points, camera, config), max(most, agreed.of_matched)
         if found is not None and (
             found.of_matched < _LEAST_ALIGNED * most or found.landmarks < constants.MIN_LANDMARKS * found.marks
         ):
             found = None
+        if contradicted((agreed if found is None else found).fit.cam_from_object):
+            contradictions += 1
+            continue
+        attempts += 1
         if found is not None and found.of_matched >= constants.MIN_SUPPORT * count:
             if best is None or len(found.index) > len(best.index):
                 best = found
@@ -124,7 +132,6 @@ def confirmed_pose(
         elif first is None:
             first, share = (agreed, constants.MIN_UNALIGNED) if found is None else (found, config.min_inlier_ratio)
             needed = share * count
-        left = others
     if best is not None:
         return best
     return first if first is not None and first.of_matched >= needed else None

@@ -14,6 +14,7 @@ from fieldpose.stages.geometry import Camera, camera_centre, viewing_angles
 from fieldpose.stages.geometry.arrays import Covariance, Pixels, Pixels32, Points, Transform, Values
 from fieldpose.stages.pnp import constants
 from fieldpose.stages.pnp.aligner import Aligner, Pictures
+from fieldpose.stages.pnp.background import Contradiction
 from fieldpose.stages.pnp.config import PnpConfig
 from fieldpose.stages.pnp.consensus import MIN_POINTS, agreed_pose, confirmed_pose
 
@@ -52,8 +53,9 @@ def solve(
 
     confidence, relative to each other, counts in the refinement and not in RANSAC. pictures: the view that gave
     the points, and the frame; with them all points are looked for anew near where RANSAC's pose puts them, whatever
-    they were matched with, and landmarks of the view besides. seen_from: where the view was, if there are none;
-    the further it is from the pose found, the less certain is that. The same input gives the same result. Data
+    they were matched with, and landmarks of the view besides; a pose that the frame's plain background contradicts is
+    none. seen_from: where the view was, if there are none; the further it is from the pose found, the less certain is
+    that. The same input gives the same result. Data
     that hold no pose give the reason: TOO_FEW_CONSISTENT_POINTS, NO_CONSENSUS or IMPLAUSIBLE_POSE.
     """
     config = config or PnpConfig()
@@ -68,7 +70,9 @@ def solve(
         seen_from = pictures.cam_from_object
         points = np.concatenate([points, _landmarks(pictures, config.landmarks)])
         aligner = Aligner(pictures, points, camera, config)
-        found = confirmed_pose(pixels_in_frame, points, camera, weights, aligner, config)
+        found = confirmed_pose(
+            pixels_in_frame, points, camera, weights, aligner, config, Contradiction(pictures, camera)
+        )
     if found is None:
         return Reason.NO_CONSENSUS
     fit, pose = found.fit, found.fit.cam_from_object

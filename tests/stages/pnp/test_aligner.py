@@ -56,6 +56,13 @@ def pictures(view: RenderedView, frame: np.ndarray) -> Pictures:
     return Pictures(view.rgb, view.depth, view.camera, view.cam_from_object, frame)
 
 
+def unplain(frame: np.ndarray) -> np.ndarray:
+    """The frame with a border of noise, so that no plain background contradicts anything."""
+    noisy = np.random.default_rng(0).integers(0, 256, frame.shape).astype(np.uint8)
+    noisy[3:-3, 3:-3] = frame[3:-3, 3:-3]
+    return noisy
+
+
 def in_frame(points: np.ndarray, lens: Camera = LENS) -> np.ndarray:
     return lens.project(points @ TRUTH[:3, :3].T + TRUTH[:3, 3])
 
@@ -186,13 +193,27 @@ def test_parts_that_look_alike_are_told_apart_by_landmarks(
         doubled[v - 9 : v + 10, u - 9 : u + 10] = frame[y - 9 : y + 10, x - 9 : x + 10]
     pixels = np.random.default_rng(1).uniform(0, 259, here.shape).astype(np.float32)
     pixels[top], pixels[right] = there[top], here[right]
-    given = pictures(view, doubled)
+    given = pictures(view, unplain(doubled))
     with monkeypatch.context() as patched:
         patched.setattr(constants, "SURE_LANDMARKS", 0.0)
         hasty = solved(solve(pixels, points, LENS, pictures=given))
     assert rotation_error_deg(pose_of(hasty), wrong) < 1
     assert translation_error(pose_of(hasty), wrong) < 0.05
     assert translation_error(pose_of(solve(pixels, points, LENS, pictures=given)), TRUTH) < 0.01
+
+
+def test_a_pose_that_the_plain_background_contradicts_leaves_its_place_to_the_next(
+    view: RenderedView, frame: np.ndarray, points: np.ndarray
+) -> None:
+    """Most matches agree on a pose that would have a part of the object where nothing is; others on the right one."""
+    wrong = exp_se3([0.35, 0.1, 0, 0, 0, 0]) @ TRUTH
+    here, there = in_frame(points), LENS.project(points @ wrong[:3, :3].T + wrong[:3, 3])
+    pixels = there.astype(np.float32)
+    pixels[::3] = here[::3]
+    assert translation_error(pose_of(solve(pixels, points, LENS)), wrong) < 0.01
+    assert translation_error(pose_of(solve(pixels, points, LENS, pictures=pictures(view, frame))), TRUTH) < 0.01
+    only_wrong = solve(there.astype(np.float32), points, LENS, pictures=pictures(view, frame))
+    assert only_wrong is Reason.NO_CONSENSUS
 
 
 def test_no_pose_is_borne_out_where_too_few_landmarks_are_found(
@@ -218,7 +239,7 @@ def test_no_pose_is_borne_out_where_too_few_landmarks_are_found(
 def test_a_frame_without_anything_leaves_the_pose_of_the_matches(
     view: RenderedView, points: np.ndarray, frame_shade: int
 ) -> None:
-    blank, pixels = np.full((260, 260, 3), frame_shade, np.uint8), matched(points, 0.3, 1.0)
+    blank, pixels = unplain(np.full((260, 260, 3), frame_shade, np.uint8)), matched(points, 0.3, 1.0)
     plain = solved(solve(pixels, points, LENS))
     looked = solved(solve(pixels, points, LENS, pictures=pictures(view, blank)))
     assert np.array_equal(pose_of(looked), pose_of(plain))
@@ -229,7 +250,7 @@ def test_few_matches_that_no_search_bears_out_are_not_believed(
     view: RenderedView, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A fifth of the matches agrees, which is enough by itself, but nothing of the view is seen in the frame."""
-    blank, pixels = np.full((260, 260, 3), 128, np.uint8), matched(points, 0.8, 0.5)
+    blank, pixels = unplain(np.full((260, 260, 3), 128, np.uint8)), matched(points, 0.8, 0.5)
     solved(solve(pixels, points, LENS))
     given = pictures(view, blank)
     assert solve(pixels, points, LENS, pictures=given) is Reason.NO_CONSENSUS
@@ -291,7 +312,7 @@ def test_a_pose_that_landmarks_do_not_bear_out_says_how_many_points_were_looked_
     scene: AnalyticScene, view: RenderedView, points: np.ndarray
 ) -> None:
     """So that it does not pass for one that all points agree on."""
-    elsewhere = photograph(scene, LENS, viewpoint(200.0, 15.0))
+    elsewhere = unplain(photograph(scene, LENS, viewpoint(200.0, 15.0)))
     believed = solved(solve(matched(points, 0.0, 1.0), points, LENS, pictures=pictures(view, elsewhere)))
     assert believed.correspondences == len(points) + 100
 

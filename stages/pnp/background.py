@@ -1,7 +1,9 @@
-"""What a plain background says of a pose: where the frame shows the background, the object cannot be.
+"""What a plain background says of a pose: where the frame shows it, the object cannot be, and elsewhere it has to be.
 
 Parts of an object that look alike agree on poses that turn it into itself there. If the rest of the object then lies on
-the background, the pose is wrong, however many points were found. What hides the object contradicts nothing.
+the background, and what the frame shows is not where the object would be, the pose is wrong, however many points were
+found. One of the two alone contradicts nothing: a field of few photographs has shreds in the air, which lie on the
+background, and what hides the object is where the object is not.
 """
 
 from __future__ import annotations
@@ -22,12 +24,14 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class PlainBackground:
-    """The pixels of a frame, shrunk to the size of views, that surely show its plain background.
+    """Of the pixels of a frame, shrunk to the size of views, those that surely show its plain background.
 
-    sure: (h, w) bool; camera: of the shrunk frame.  colour: (3,) int, the background's.
+    sure: (h, w) bool; other (h, w): those that surely do not. camera: of the shrunk frame.  colour: (3,) int, the
+    background's.
     """
 
     sure: Mask
+    other: Mask
     camera: Camera
     colour: np.ndarray
 
@@ -41,18 +45,33 @@ class PlainBackground:
             return None
         low, high = colour - constants.PLAIN, colour + constants.PLAIN
         alike = cv2.inRange(image, low.astype(np.float64), high.astype(np.float64))
-        sure = cv2.erode(_from_border(alike), np.ones((2 * constants.NEAR_PX + 1,) * 2, np.uint8))
-        return cls(sure.astype(bool), camera, colour)
+        background = _from_border(alike)
+        sure = cv2.erode(background, np.ones((2 * constants.NEAR_PX + 1,) * 2, np.uint8)).astype(bool)
+        distinct = np.abs(image.astype(np.int16) - colour).max(axis=2) > constants.DISTINCT
+        return cls(sure, distinct & (background == 0), camera, colour)
 
     def share_on_it(self, points: Points, cam_from_object: Transform) -> float:
         """Of the points (n, 3) of the object that a pose puts into the frame, the share that lies on the background."""
+        x, y = self._pixels(points, cam_from_object)
+        return float(self.sure[y, x].mean()) if len(x) else 0.0
+
+    def share_unexplained(self, points: Points, cam_from_object: Transform) -> float:
+        """Of the pixels that show something else, the share that none of the points (n, 3) of the object is near."""
+        x, y = self._pixels(points, cam_from_object)
+        explained = np.zeros(self.other.shape, np.uint8)
+        explained[y, x] = 1
+        near = cv2.dilate(explained, np.ones((2 * constants.EXPLAINS_PX + 1,) * 2, np.uint8)) > 0
+        return float((~near)[self.other].mean()) if self.other.any() else 0.0
+
+    def _pixels(self, points: Points, cam_from_object: Transform) -> tuple[np.ndarray, np.ndarray]:
+        """Columns and rows of the points that a pose puts into the frame."""
         in_cam = points @ cam_from_object[:3, :3].T + cam_from_object[:3, 3]
         pixels = self.camera.project(in_cam)
         with np.errstate(invalid="ignore"):
             size = (self.camera.width - 0.5, self.camera.height - 0.5)
             inside = (in_cam[:, 2] > 0) & ((pixels >= -0.5) & (pixels < size)).all(axis=1)
         x, y = np.rint(pixels[inside]).astype(np.int64).T
-        return float(self.sure[y, x].mean()) if len(x) else 0.0
+        return x, y
 
 
 class Contradiction:
@@ -60,13 +79,23 @@ class Contradiction:
 
     def __init__(self, pictures: Pictures, camera: Camera) -> None:
         self._background = PlainBackground.of(pictures.frame, camera, max(pictures.depth.shape))
-        self._points = np.zeros((0, 3)) if self._background is None else _distinct(pictures, self._background.colour)
+        self._shown, self._distinct = np.zeros((0, 3)), np.zeros((0, 3))
+        if self._background is not None:
+            self._shown = _points(pictures, pictures.depth > 0, constants.SPARSE_PX)
+            differs = np.abs(pictures.view.astype(np.int16) - self._background.colour).max(axis=2) > constants.DISTINCT
+            self._distinct = _points(pictures, (pictures.depth > 0) & differs, constants.CELL_PX)
 
     def __call__(self, cam_from_object: Transform) -> bool:
-        """Whether it does."""
-        if self._background is None or len(self._points) < constants.LEAST_DISTINCT:
+        """Whether it does, by what of the object lies on the background, and what the frame shows of it elsewhere."""
+        if self._background is None or len(self._distinct) < constants.LEAST_DISTINCT:
             return False
-        return self._background.share_on_it(self._points, cam_from_object) > constants.CONTRADICTED
+        on_it = self._background.share_on_it(self._distinct, cam_from_object)
+        if 2 * on_it <= constants.CONTRADICTED:
+            return False
+        if on_it > constants.OFF_IT:
+            return True
+        unexplained = self._background.share_unexplained(self._shown, cam_from_object)
+        return 2 * on_it * unexplained > constants.CONTRADICTED * (on_it + unexplained)
 
 
 def _from_border(alike: np.ndarray) -> np.ndarray:
@@ -79,14 +108,12 @@ def _from_border(alike: np.ndarray) -> np.ndarray:
     return reached[label]
 
 
-def _distinct(pictures: Pictures, colour: np.ndarray) -> np.ndarray:
-    """Points (n, 3) of the object that the view shows in another colour, one of each few pixels, thin parts too."""
-    differs = np.abs(pictures.view.astype(int) - colour).max(axis=2) > constants.DISTINCT
-    y, x = np.nonzero((pictures.depth > 0) & differs)
+def _points(pictures: Pictures, of: Mask, cell_px: int) -> np.ndarray:
+    """Points (n, 3) of the object at some of the view's pixels, one in each cell of that side, thin parts too."""
+    y, x = np.nonzero(of)
     turn = np.random.default_rng(_SEED).permutation(len(y))
     y, x = y[turn], x[turn]
-    cell = y // constants.CELL_PX * pictures.camera.width + x // constants.CELL_PX
-    _, one = np.unique(cell, return_index=True)
+    _, one = np.unique(y // cell_px * pictures.camera.width + x // cell_px, return_index=True)
     pixels = np.stack([x[one], y[one]], axis=1).astype(np.float32)
     depth = pictures.depth[y[one], x[one]]
     return points_at_depth(pictures.camera, pictures.cam_from_object, pixels, depth).astype(np.float64)

@@ -53,9 +53,12 @@ def test_a_pose_that_puts_the_object_on_the_background_is_contradicted(frame: np
     found = PlainBackground.of(frame, LENS, longer_side)
     assert found is not None
     points = _surface()
-    assert found.share_on_it(points, TRUTH) < constants.CONTRADICTED
-    for twist in ([0.4, 0, 0, 0, 0, 0], [0, -0.4, 0, 0, 0, 0], [0, 0, -1.2, 0, 0, 0], [0.0, 0, 0, 0, 0, 0.5]):
-        assert found.share_on_it(points, exp_se3(np.array(twist)) @ TRUTH) > 3 * constants.CONTRADICTED, twist
+    assert found.share_on_it(points, TRUTH) < 0.1 * constants.CONTRADICTED
+    assert found.share_unexplained(points, TRUTH) < 0.5 * constants.CONTRADICTED
+    assert found.share_on_it(points, exp_se3(np.array([0, 0, -1.6, 0, 0, 0.0])) @ TRUTH) > constants.OFF_IT
+    for twist in ([0.4, 0, 0, 0, 0, 0], [0, -0.4, 0, 0, 0, 0], [0.0, 0, 0, 0, 0, 0.5]):
+        assert found.share_on_it(points, exp_se3(np.array(twist)) @ TRUTH) > 2 * constants.CONTRADICTED, twist
+        assert found.share_unexplained(points, exp_se3(np.array(twist)) @ TRUTH) > 2 * constants.CONTRADICTED, twist
 
 
 def _surface() -> np.ndarray:
@@ -70,17 +73,20 @@ def _surface() -> np.ndarray:
 def test_the_share_is_that_of_points_looked_up_one_by_one(seed: int) -> None:
     rng = np.random.default_rng(seed)
     lens = Camera(40, 30, 35.0, 36.0, 19.0, 15.0, (-0.2, 0.05, 0.0, 0.0, 0.0))
-    background = PlainBackground(rng.random((30, 40)) < 0.5, lens, np.zeros(3, int))
+    background = PlainBackground(rng.random((30, 40)) < 0.5, rng.random((30, 40)) < 0.3, lens, np.zeros(3, int))
     points = rng.normal(0, 1, (60, 3))
     pose = exp_se3(np.concatenate([rng.normal(0, 0.5, 3), rng.normal(0, 0.5, 3)])) @ viewpoint(distance=2.0)
-    on_it = []
+    on_it, far = [], background.other.copy()
     for point in points:
         in_cam = pose[:3, :3] @ point + pose[:3, 3]
         if in_cam[2] > 0:
             x, y = lens.project(in_cam[None])[0]
             if -0.5 <= x < 39.5 and -0.5 <= y < 29.5:
                 on_it.append(background.sure[round(y), round(x)])
+                rows, columns = np.ogrid[:30, :40]
+                far &= np.maximum(abs(rows - round(y)), abs(columns - round(x))) > constants.EXPLAINS_PX
     assert background.share_on_it(points, pose) == pytest.approx(np.mean(on_it) if on_it else 0.0)
+    assert background.share_unexplained(points, pose) == pytest.approx(far.sum() / background.other.sum())
 
 
 def test_what_hides_the_object_contradicts_nothing(frame: np.ndarray) -> None:

@@ -1,17 +1,26 @@
-"""Which of many photographs to match with each other: those that, by their poses, may show the same."""
+"""Which of many photographs to match with each other: those that by their poses, or by their looks, show the same.
+
+Source: Jégou and others, Aggregating local descriptors into a compact image representation (2010), for looks.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import cv2
 import numpy as np
 
 from fieldpose.stages.geometry import camera_centres
 from fieldpose.stages.geometry.arrays import Transforms
+from fieldpose.stages.structure.features import Keypoints, root
 
 NEAREST = 8
 """Partners of an image that are nearest to it; a point is to be found in three images at least."""
 FARTHER = 6
 """Partners besides, at ranks each so many times farther than the one before: they keep long chains from bending."""
 _RANK_GROWTH = 1.5
+_WORDS, _SAMPLE = 64, 20_000
+"""Of which looks are told, and descriptors that these are chosen by."""
 WIDEST_DEG = 60.0
 """Between the axes of partners: SIFT is good up to some 50 degrees between directions of view (Lowe, section 5)."""
 
@@ -47,3 +56,29 @@ def _apart(cam_from_object: Transforms) -> np.ndarray:
     cost[angle > WIDEST_DEG] = np.inf
     np.fill_diagonal(cost, np.inf)
     return cost
+
+
+def alike_pairs(keypoints: Sequence[Keypoints], partners: int) -> list[tuple[int, int]]:
+    """Pairs (i, j), i < j, sorted: for each image those that look most like it, by their descriptors."""
+    signatures = _signatures([root(found.descriptors) for found in keypoints])
+    alike = signatures @ signatures.T
+    np.fill_diagonal(alike, -np.inf)
+    best = np.argsort(-alike, axis=1, kind="stable")[:, :partners]
+    return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
+
+
+def _signatures(descriptors: Sequence[np.ndarray]) -> np.ndarray:
+    """(n, words * 128), of length 1 each: how an image's descriptors differ from the words that are nearest to them."""
+    everything = np.concatenate(descriptors)
+    some = everything[np.random.default_rng(0).permutation(len(everything))[:_SAMPLE]]
+    words = min(_WORDS, len(some))
+    cv2.setRNGSeed(0)
+    criteria = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 20, 1e-4)
+    _, _, centres = cv2.kmeans(some, words, None, criteria, 1, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
+    result = np.zeros((len(descriptors), words, everything.shape[1]), np.float32)
+    for signature, own in zip(result, descriptors, strict=True):
+        nearest = (own @ centres.T - 0.5 * (centres**2).sum(axis=1)).argmax(axis=1)
+        np.add.at(signature, nearest, own - centres[nearest])
+    flat = result.reshape(len(descriptors), -1)
+    flat = np.sign(flat) * np.sqrt(np.abs(flat))
+    return flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fieldpose.stages.geometry import camera_centres
-from fieldpose.stages.geometry.arrays import Matrix3, Transforms, Vector
+from fieldpose.stages.geometry.arrays import Matrix3, Points64, Transforms, Vector
 from fieldpose.stages.geometry.rigid import skew
 
 _STEPS = 50
@@ -29,6 +29,10 @@ class Similarity:
         centres = self.scale * camera_centres(cam_from_source) @ self.rotation.T + self.translation
         moved[:, :3, 3] = -np.einsum("nij,nj->ni", moved[:, :3, :3], centres)
         return moved
+
+    def of_points(self, points: Points64) -> Points64:
+        """Points (n, 3) of the source in the target's coordinates."""
+        return self.scale * points @ self.rotation.T + self.translation
 
 
 def align(cam_from_source: Transforms, cam_from_target: Transforms) -> Similarity:

@@ -14,9 +14,7 @@ from fieldpose.stages.camera.calibration import Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.images import shrunk_with_camera
-from fieldpose.stages.nerf.datasets.images import EXTENSIONS, WHITE, load_pixels, over_background, probe
-
-_ORIENTATION = 0x0112
+from fieldpose.stages.nerf.datasets.images import EXTENSIONS, ORIENTATION, WHITE, load_pixels, over_background, probe
 
 
 def open_folder(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
@@ -68,4 +66,4 @@ def _size(path: Path) -> tuple[int, int]:
 def _can_stay_encoded(path: Path) -> bool:
     """An RGB JPEG that no decoder turns: EXIF orientation is ignored here, as it is in datasets."""
     with Image.open(path) as image:
-        return image.format == "JPEG" and image.mode == "RGB" and image.getexif().get(_ORIENTATION, 1) == 1
+        return image.format == "JPEG" and image.mode == "RGB" and image.getexif().get(ORIENTATION, 1) == 1

@@ -9,11 +9,14 @@ from typing import TypeVar
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 from fieldpose.errors import DatasetError
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+ORIENTATION = 0x0112
+"""EXIF's number for it; from 5 on width and height change places."""
+_FIRST_ACROSS = 5
 Colour = tuple[int, int, int]
 WHITE: Colour = (255, 255, 255)
 PLAIN_WITHIN, PLAIN_SHARE, PLAIN_BORDER = 6, 0.95, 0.02
@@ -97,6 +100,29 @@ def over_background(rgba: np.ndarray, background: Colour | None) -> np.ndarray:
     alpha = rgba[..., 3:].astype(np.float32) / 255
     colour = rgba[..., :3] * alpha + np.array(background or (0, 0, 0), np.float32) * (1 - alpha)
     return np.rint(colour).astype(np.uint8)
+
+
+def upright(path: Path) -> np.ndarray:
+    """The pixels (h, w, 3) uint8 RGB of an image file, turned as its EXIF orientation says.
+
+    Transparent parts are laid over white. Raises DatasetError.
+    """
+
+    def turned(image: Image.Image) -> np.ndarray:
+        pixels = ImageOps.exif_transpose(image)
+        return over_background(np.array(pixels.convert("RGBA" if _has_alpha(image) else "RGB")), WHITE)
+
+    return _read(path, turned)
+
+
+def upright_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file as upright() gives it. Raises DatasetError."""
+
+    def size(image: Image.Image) -> tuple[int, int]:
+        across = image.getexif().get(ORIENTATION, 1) >= _FIRST_ACROSS
+        return (image.height, image.width) if across else (image.width, image.height)
+
+    return _read(path, size)
 
 
 def _read(path: Path, use: Callable[[Image.Image], _Result]) -> _Result:

@@ -1,0 +1,372 @@
+"""From a video or photographs of an object to a dataset: frames chosen, cameras found, a frame of reference, files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from fieldpose.deploy.reporting.output import write_bytes, write_json
+from fieldpose.errors import DatasetError, SourceError
+from fieldpose.stages.camera.calibration import focal_length_from_exif
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.core import Source
+from fieldpose.stages.camera.sources import open_source
+from fieldpose.stages.camera.sources.folder import natural
+from fieldpose.stages.cores import usable_cores
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.images import decoded, shrunk
+from fieldpose.stages.nerf.datasets.images import EXTENSIONS, upright, upright_size
+from fieldpose.stages.nerf.datasets.transforms import FILE
+from fieldpose.stages.nerf.datasets.writing import transforms_document
+
+if TYPE_CHECKING:
+    from fieldpose.stages.structure.features import Keypoints
+    from fieldpose.stages.structure.mapping import Mapped
+    from fieldpose.stages.structure.tracks import Tracks
+
+Report = Callable[[str, float], None]
+IMAGES = "images"
+CAMERA_FILE = "camera.json"
+HELD_OUT_EVERY = 10
+"""One in so many images is not learnt from, and tells how good the field is."""
+FEWEST = 8
+"""Images that a field can be learnt from at all, and still few."""
+ENOUGH = 0.8
+"""Of the images are to find a place; else the reasons are told."""
+_QUALITY = 95
+_NEIGHBOURS = 8
+"""Frames of a video that each is matched with: those that came before it."""
+_ALL_PAIRS = 80
+"""So many photographs are each matched with each other one; of more, each with those that look most like it."""
+_LOOKALIKES = 25
+_UNSURE_FOCAL = 1.2
+"""Focal length over the longer side that is taken where nothing tells it: 45 degrees, about that of phones."""
+_FEW_KEYPOINTS = 150
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image to find a camera for: its name in the dataset, the bytes of its upright JPEG file, and its size."""
+
+    name: str
+    jpeg: bytes
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Shots:
+    """What was chosen of a source, how many images it has, those left out as blurred, and what is known of the lens.
+
+    focal_px: of the images' own size, None where nothing tells it. follow: whether they follow one another in time.
+    """
+
+    chosen: tuple[Shot, ...]
+    seen: int
+    blurred: tuple[str, ...]
+    focal_px: float | None
+    follow: bool
+
+
+@dataclass(frozen=True)
+class Captured:
+    """A dataset that was made, in figures; `reasons` of the images without a place: name -> why."""
+
+    images: int
+    chosen: int
+    blurred: int
+    seen: int
+    reasons: dict[str, str]
+    camera: Camera
+    error_px: float
+    on_plane: bool
+    metres_per_unit: float | None
+
+
+def capture(
+    source: str, out: Path, most: int, size: int, threads: int = 0, report: Report = lambda what, share: None
+) -> Captured:
+    """Write a dataset of a source (a video, a folder of photographs, or any camera source) into a folder.
+
+    At most `most` frames of a video are taken, and images are shrunk to `size`. Raises SourceError where it cannot be
+    read, and DatasetError where too few cameras are found, which tells why; then nothing is written.
+    """
+    shots = _shots(source, most, size, report)
+    if len(shots.chosen) < FEWEST:
+        blurred = f"; {len(shots.blurred)} were left out as blurred, so move slowly" if shots.blurred else ""
+        raise DatasetError(
+            f"{source}: {len(shots.chosen)} usable images, but at least {FEWEST} are needed; film longer, moving around"
+            f" the object{blurred}"
+        )
+    threads = threads or usable_cores()
+    structure = Structure(shots, threads, report)
+    mapped = structure.map()
+    if mapped is None or len(mapped.index) < FEWEST:
+        count = 0 if mapped is None else len(mapped.index)
+        why = structure.why_not(mapped)
+        raise DatasetError(
+            f"{source}: cameras of only {count} of {len(shots.chosen)} images were found ({summary(why)});"
+            f" {advice(why)}"
+        )
+    return _write(out, shots, mapped, structure, report)
+
+
+def summary(why: dict[str, str]) -> str:
+    """How many images are without a place for which reason."""
+    counts = {reason: list(why.values()).count(reason) for reason in dict.fromkeys(why.values())}
+    return ", ".join(f"{count} {reason}" for reason, count in counts.items())
+
+
+def advice(why: dict[str, str]) -> str:
+    """What to film anew, by the commonest reason."""
+    reasons = list(why.values())
+    commonest = max(set(reasons), key=reasons.count) if reasons else NO_OVERLAP
+    return _ADVICE[commonest]
+
+
+BLURRED, TOO_LITTLE, NO_OVERLAP, NO_PLACE = "blurred", "with too little texture", "without overlap", "without a place"
+_ADVICE = {
+    BLURRED: "film them again with more light, or moving more slowly",
+    TOO_LITTLE: "put the object on something with print on it, like a newspaper, so that there is something to match",
+    NO_OVERLAP: "film the way to them as well, in steps of a few degrees",
+    NO_PLACE: "film those parts again from more places, each part from at least three",
+}
+
+
+class Structure:
+    """Finds the cameras of shots: keypoints, matches, a map of what follows in time, then of what is near in space."""
+
+    def __init__(self, shots: Shots, threads: int, report: Report) -> None:
+        self._shots, self._threads, self._report = shots, threads, report
+        first = shots.chosen[0]
+        self._camera = _guessed(first.width, first.height, shots.focal_px)
+        self._keypoints: list[Keypoints] = []
+        self._pairs: list[tuple[int, int]] = []
+        self._matches: list[np.ndarray] = []
+        self._sharpness: list[float] = []
+
+    def map(self) -> Mapped | None:
+        """Cameras in a frame of their own, None where no two images fit."""
+        from fieldpose.stages.structure.mapping import map_images
+
+        self._find_keypoints()
+        self._match(self._first_pairs())
+        mapped = map_images(
+            self._keypoints, self._pairs, self._matches, self._small, self._shots.focal_px is not None, self._threads,
+            lambda share: self._report("finding the cameras", share),
+        )  # fmt: skip
+        return None if mapped is None else self._closed(mapped)
+
+    def why_not(self, mapped: Mapped | None) -> dict[str, str]:
+        """Of each image without a place, by its name, why."""
+        from fieldpose.stages.structure.mapping import overlap
+        from fieldpose.stages.structure.selection import BLURRED as BLURRED_BELOW
+
+        placed = set() if mapped is None else set(mapped.index.tolist())
+        shares = overlap(len(self._keypoints), self._pairs, self._matches)
+        typical = float(np.median(self._sharpness))
+        why = {}
+        for i, shot in enumerate(self._shots.chosen):
+            if i in placed:
+                continue
+            blurred = self._sharpness[i] < BLURRED_BELOW * typical
+            few = len(self._keypoints[i]) < _FEW_KEYPOINTS
+            why[shot.name] = (
+                TOO_LITTLE if few and not shares[i] else BLURRED if blurred else NO_PLACE if shares[i] else NO_OVERLAP
+            )
+        return why
+
+    @property
+    def _small(self) -> Camera:
+        from fieldpose.stages.structure.mending import LONGER_SIDE
+
+        return self._camera.shrunk(LONGER_SIDE)
+
+    def _find_keypoints(self) -> None:
+        from fieldpose.stages.structure.features import find_keypoints
+        from fieldpose.stages.structure.mending import MOST_KEYPOINTS
+        from fieldpose.stages.structure.selection import sharpness
+
+        small = self._small
+
+        def found(shot: Shot) -> tuple[Keypoints, float]:
+            image = shrunk(_image(shot), max(small.width, small.height))
+            return find_keypoints(image, MOST_KEYPOINTS), sharpness(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+
+        with ThreadPoolExecutor(self._threads) as pool:
+            for keypoints, sharp in pool.map(found, self._shots.chosen):
+                self._keypoints.append(keypoints)
+                self._sharpness.append(sharp)
+                self._report("looking for points", len(self._keypoints) / len(self._shots.chosen))
+
+    def _first_pairs(self) -> list[tuple[int, int]]:
+        from fieldpose.stages.structure.pairs import alike_pairs
+
+        count = len(self._keypoints)
+        if self._shots.follow:
+            return [(i, j) for i in range(count) for j in range(i + 1, min(i + 1 + _NEIGHBOURS, count))]
+        if count <= _ALL_PAIRS:
+            return [(i, j) for i in range(count) for j in range(i + 1, count)]
+        return alike_pairs(self._keypoints, _LOOKALIKES)
+
+    def _match(self, pairs: Sequence[tuple[int, int]]) -> None:
+        from fieldpose.stages.structure.matches import match_pairs
+
+        new = sorted(set(pairs) - set(self._pairs))
+        if new:
+            found = match_pairs(self._keypoints, new, self._threads, lambda share: self._report("matching", share))
+            self._pairs += new
+            self._matches += found
+
+    def _closed(self, mapped: Mapped) -> Mapped:
+        """With what images share that are near by the cameras found, as where a video comes back to its beginning.
+
+        Nearness in space comes after nearness in time: parts that look alike, like a label that is there twice, would
+        fold the way over itself.
+        """
+        from fieldpose.stages.structure.adjustment import adjust
+        from fieldpose.stages.structure.pairs import choose_pairs
+        from fieldpose.stages.structure.posed import PosedCameras
+        from fieldpose.stages.structure.tracks import join_tracks
+        from fieldpose.stages.structure.triangulation import triangulate
+
+        near = choose_pairs(mapped.cam_from_object)
+        self._match([(int(mapped.index[i]), int(mapped.index[j])) for i, j in near])
+        self._report("adjusting the cameras", 0.0)
+        tracks = join_tracks(self._keypoints, self._pairs, self._matches)
+        posed = PosedCameras((mapped.camera,) * len(mapped.index), mapped.cam_from_object)
+        tracks = _as_placed(tracks, mapped.index, len(self._keypoints))
+        adjusted = adjust(posed, tracks, "distortion")
+        found = triangulate(adjusted, tracks)
+        good = np.isfinite(np.bincount(tracks.track, found.error_px, tracks.count)) & (found.angle_rad > _LEAST_ANGLE)
+        self._report("adjusting the cameras", 1.0)
+        return replace(
+            mapped, camera=adjusted.cameras[0], cam_from_object=adjusted.cam_from_object, points=found.points[good],
+            seen=tracks.seen_by(len(mapped.index)), error_px=float(np.median(found.error_px)),
+        )  # fmt: skip
+
+
+_LEAST_ANGLE = np.deg2rad(2.0)
+
+
+def _as_placed(tracks: Tracks, index: np.ndarray, count: int) -> Tracks:
+    """The tracks as the placed images alone see them, these numbered anew."""
+    number = np.full(count, -1)
+    number[index] = np.arange(len(index))
+    inner = tracks.without(number[tracks.image] < 0)
+    return replace(inner, image=number[inner.image])
+
+
+def _write(out: Path, shots: Shots, mapped: Mapped, structure: Structure, report: Report) -> Captured:
+    from fieldpose.stages.structure.upright import stand
+
+    standing = stand(mapped.cam_from_object, mapped.points)
+    poses = standing.object_from_map.of_poses(mapped.cam_from_object)
+    chosen = [shots.chosen[i] for i in mapped.index]
+    names = [f"{IMAGES}/{shot.name}" for shot in chosen]
+    cameras = [mapped.camera.resized(shot.width, shot.height) for shot in chosen]
+    held_out = set(names[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY])
+    for i, shot in enumerate(chosen):
+        write_bytes(out / IMAGES / shot.name, shot.jpeg)
+        report("writing the images", (i + 1) / len(chosen))
+    write_json(out / CAMERA_FILE, cameras[0])
+    write_json(out / FILE, transforms_document(names, cameras, poses, held_out))
+    return Captured(
+        len(chosen), len(shots.chosen), len(shots.blurred), shots.seen, structure.why_not(mapped), cameras[0],
+        mapped.error_px, standing.on_plane, None,
+    )  # fmt: skip
+
+
+def _shots(source: str, most: int, size: int, report: Report) -> Shots:
+    path = Path(source)
+    if path.is_dir():
+        return _photographs(path, size, report)
+    name = source if ":" in source and not path.exists() else f"video:{source}"
+    if name.startswith("folder:"):
+        return _photographs(Path(name.partition(":")[2]), size, report)
+    return _frames(open_source(CameraConfig(source=name)), most, size, report)
+
+
+def _photographs(folder: Path, size: int, report: Report) -> Shots:
+    """All images of a folder, upright as their EXIF says, files that are there twice only once.
+
+    Those that stand where most lie, or the other way round, are turned by a quarter: one lens then has one camera.
+    """
+    paths = sorted((p for p in folder.iterdir() if _is_image(p)), key=natural) if folder.is_dir() else []
+    if not paths:
+        raise SourceError(f"{folder}: no images in this folder; expected {', '.join(EXTENSIONS)}")
+    shots: list[Shot] = []
+    focals: list[float] = []
+    known: set[bytes] = set()
+    portrait = 2 * sum(height > width for width, height in map(upright_size, paths)) > len(paths)
+    for i, path in enumerate(paths):
+        image = upright(path)
+        if (image.shape[0] > image.shape[1]) != portrait and image.shape[0] != image.shape[1]:
+            image = np.ascontiguousarray(np.rot90(image))
+        shot = _shot(f"{path.stem}.jpg", image, size)
+        if shot.jpeg in known:
+            continue
+        known.add(shot.jpeg)
+        shots.append(shot)
+        focal = focal_length_from_exif(path, shot.width, shot.height)
+        focals += [] if focal is None else [focal]
+        report("reading the photographs", (i + 1) / len(paths))
+    _check_shapes(folder, shots)
+    focal = float(np.median(focals)) if len(focals) == len(shots) else None
+    return Shots(tuple(shots), len(paths), (), focal, False)
+
+
+def _check_shapes(folder: Path, shots: Sequence[Shot]) -> None:
+    shapes = {(s.width, s.height) for s in shots}
+    if len(shapes) > 1:
+        named = ", ".join(f"{w}x{h}" for w, h in sorted(shapes))
+        raise SourceError(
+            f"{folder}: images of several sizes ({named}), so of several cameras; keep those of one camera"
+        )
+
+
+def _is_image(path: Path) -> bool:
+    return path.suffix.lower() in EXTENSIONS and not path.name.startswith(".")
+
+
+def _frames(source: Source, most: int, size: int, report: Report) -> Shots:
+    from fieldpose.stages.structure.selection import Chooser, Meter
+
+    meter, chooser = Meter(), Chooser[Shot](most)
+    for image in _images(source):
+        measured = meter(image)
+        if chooser.wants(measured):
+            chooser.keep(measured, _shot(f"{chooser.seen - 1:05d}.jpg", image, size))
+        report("choosing frames", min(chooser.seen / source.length, 1.0) if source.length else 0.0)
+    chosen, blurred = chooser.chosen()
+    return Shots(tuple(c.payload for c in chosen), chooser.seen, tuple(c.payload.name for c in blurred), None, True)
+
+
+def _images(source: Source) -> Iterator[np.ndarray]:
+    for frame in source.frames(0):
+        image = decoded(frame.encoding, frame.image, frame.camera.width, frame.camera.height)
+        if image is not None:
+            yield image
+
+
+def _shot(name: str, image: np.ndarray, size: int) -> Shot:
+    image = shrunk(image, size)
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return Shot(name, jpeg.tobytes(), image.shape[1], image.shape[0])
+
+
+def _image(shot: Shot) -> np.ndarray:
+    image = decoded("jpeg", np.frombuffer(shot.jpeg, np.uint8), shot.width, shot.height)
+    assert image is not None, "what was encoded here can be decoded"
+    return image
+
+
+def _guessed(width: int, height: int, focal_px: float | None) -> Camera:
+    focal = _UNSURE_FOCAL * max(width, height) if focal_px is None else focal_px
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)

@@ -1,0 +1,102 @@
+"""From a video or photographs to a dataset that a field can be learnt from."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tyro
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from fieldpose.deploy.capturing import ENOUGH, Captured, advice, capture, summary
+from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
+from fieldpose.errors import OutputError, UsageError
+
+
+@dataclass(frozen=True)
+class Options:
+    """Find the cameras of a video's frames or of photographs, and write both as a dataset to train on.
+
+    Example: fieldpose capture can.mp4 --out out/can && fieldpose train out/can --out out/can.safetensors
+
+    Walk around the object, slowly and in a good light, so that each part of it is seen from several sides, and leave
+    it where it stands. Sharp frames are chosen, evenly along the way that the picture moved; cameras are found by what
+    the images share, one lens for all of them; up is that of the plane that the object stands on, the origin is on it
+    under what the cameras look at, and the unit, which no image tells, the median distance of the cameras from there.
+    The dataset has images/, transforms.json, in which one image in ten is held out, and camera.json, the camera that
+    was found, for `run` (--camera.camera-file). Photographs are turned as their EXIF says. The JSON file has: seen,
+    chosen, blurred, images (with a camera), reasons (image -> why it has none), camera, error_px, on_plane (whether up
+    is a plane's), metres_per_unit (null: not known), seconds.
+    """
+
+    source: tyro.conf.Positional[str]
+    """A video file, a folder of photographs, or a source as `run` takes it (video:FILE, mcap:FILE)."""
+    out: Path
+    """The folder to write; it is to be empty or not there."""
+    most: int = 150
+    """At most so many frames of a video."""
+    size: int = 1600
+    """Images whose longer side has more pixels are shrunk to it."""
+    threads: int = 0
+    """0: one for each core."""
+    json: Path | None = None
+    """Write the figures into this file."""
+
+    def run(self) -> int:
+        """Capture, say what was found."""
+        if self.most < 3 or self.size < 64 or self.threads < 0:
+            raise UsageError("--most must be at least 3, --size at least 64, and --threads at least 0")
+        if self.out.exists() and (not self.out.is_dir() or any(self.out.iterdir())):
+            raise OutputError(f"{self.out}: is there already and not empty; name another folder, or remove it")
+        check_writable(self.out / "transforms.json", self.json)
+        began = time.monotonic()
+        with _progress_bar() as report:
+            captured = capture(self.source, self.out, self.most, self.size, self.threads, report)
+        seconds = time.monotonic() - began
+        write_json(self.json, {**asdict(captured), "seconds": seconds})
+        for line in _in_words(captured, self.out, seconds):
+            print(line)
+        return 0
+
+
+def _in_words(captured: Captured, out: Path, seconds: float) -> Iterator[str]:
+    camera = captured.camera
+    blurred = f", {captured.blurred} left out as blurred" if captured.blurred else ""
+    lens = f"focal length {camera.fx:.0f} px at {camera.width}x{camera.height}"
+    yield (
+        f"{out}: {captured.images} of {captured.chosen} images have a camera (of {captured.seen} seen{blurred}), error"
+        f" {captured.error_px:.2f} px, {lens}; {seconds:.0f} s"
+    )
+    up = "what the object stands on" if captured.on_plane else "the cameras (no plane was found under the object)"
+    yield f"up is that of {up}; lengths are in the median distance of the cameras from what they look at"
+    if captured.reasons:
+        few = captured.images < ENOUGH * captured.chosen
+        yield (
+            f"{len(captured.reasons)} images have no camera: {summary(captured.reasons)}"
+            f"{'; ' + advice(captured.reasons) if few else ''}"
+        )
+    yield f"next: fieldpose train {out} --out {out}.safetensors"
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Callable[[str, float], None]]:
+    """Gives a function that shows what is done and its share, as lines where stderr is no terminal."""
+    console = progress_console()
+    columns = (BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task, last = bar.add_task("reading", total=1.0), ""
+
+        def report(what: str, share: float) -> None:
+            nonlocal last, task
+            if what != last:
+                bar.remove_task(task)
+                task = bar.add_task(what, total=1.0)
+                if not console.is_terminal:
+                    console.print(f"capture: {what}")
+            last = what
+            bar.update(task, completed=share)
+
+        yield report

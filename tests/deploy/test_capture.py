@@ -1,0 +1,150 @@
+"""From pictures without poses to a dataset, as users have them: a video file, a folder of photographs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from support.commands import fieldpose
+from support.papered_room import cameras_before_a_wall, photograph
+
+from fieldpose.deploy.capturing import CAMERA_FILE, NO_OVERLAP, TOO_LITTLE, advice, capture, summary
+from fieldpose.errors import DatasetError, SourceError
+from fieldpose.stages.camera.calibration import read_camera_file
+from fieldpose.stages.geometry import Camera, camera_centres, look_at, rotation_error_deg
+from fieldpose.stages.nerf.datasets import load_dataset
+from fieldpose.stages.structure.similarity import align
+
+LENS = Camera(480, 360, 400.0, 400.0, 239.5, 179.5)
+ORIENTATION = 0x0112
+
+
+def walk(count: int) -> np.ndarray:
+    """cam_from_object of a camera that walks along a corner of the room and looks at it."""
+    along = np.linspace(-1.0, 1.0, count)
+    eyes = np.stack([-0.6 + 0.5 * np.cos(along), 0.8 * along, 0.2 * np.sin(3 * along)], axis=1)
+    return np.stack([look_at(eye, (1.8, 1.0, -0.2), (0, 0, 1)) for eye in eyes])
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[np.ndarray]:
+    return [photograph(LENS, pose) for pose in walk(40)]
+
+
+@pytest.fixture(scope="module")
+def video(pictures: list[np.ndarray], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three frames at rest first, one in five blurred."""
+    path = tmp_path_factory.mktemp("video") / "walk.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30.0, (LENS.width, LENS.height))  # type: ignore[attr-defined]
+    for i, picture in enumerate([pictures[0]] * 3 + pictures):
+        image = cv2.GaussianBlur(picture, (0, 0), 4.0) if i % 5 == 4 else picture
+        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    writer.release()
+    return path
+
+
+def errors(root: Path, truth: dict[str, np.ndarray]) -> tuple[float, float]:
+    """Greatest errors of a dataset's cameras, in degrees and metres, after the similarity that fits best."""
+    found = {Path(r.name).stem: r.cam_from_object for r in load_dataset(root, "all").images}
+    assert found.keys() <= truth.keys()
+    ours, theirs = np.stack(list(found.values())), np.stack([truth[name] for name in found])
+    aligned = align(ours, theirs).of_poses(ours)
+    turned = [rotation_error_deg(a, b) for a, b in zip(aligned, theirs, strict=True)]
+    return max(turned), float(np.linalg.norm(camera_centres(aligned) - camera_centres(theirs), axis=1).max())
+
+
+def test_a_video_becomes_a_dataset(video: Path, tmp_path: Path) -> None:
+    out, figures = tmp_path / "room", tmp_path / "figures.json"
+    ran = fieldpose("capture", video, "--out", out, "--json", figures, "--threads", 2, cwd=tmp_path, timeout_s=120)
+    assert ran.returncode == 0, ran.stderr
+    told = json.loads(figures.read_text())
+    assert told["seen"] == 43
+    assert told["images"] >= 25
+    assert all(int(Path(name).stem) % 5 == 4 for name in told["reasons"])
+    assert told["metres_per_unit"] is None
+    assert f"{told['images']} of {told['chosen']} images have a camera (of 43 seen" in ran.stdout
+    truth = {f"{i:05d}": pose for i, pose in enumerate([walk(40)[0]] * 3 + list(walk(40)))}
+    degrees, length = errors(out, truth)
+    assert degrees < 0.5
+    assert length < 0.04
+    names = {path.stem for path in (out / "images").iterdir()}
+    assert len(names & {"00000", "00001", "00002"}) == 1
+    camera = read_camera_file(out / CAMERA_FILE)
+    assert camera.fx == pytest.approx(400, rel=0.06)
+    dataset = load_dataset(out, "test")
+    assert 0 < len(dataset) <= len(names) / 8
+    assert dataset.images[0].camera == camera
+    again = fieldpose("capture", video, "--out", out, cwd=tmp_path)
+    assert again.returncode == 2
+    assert "not empty" in again.stderr
+
+
+def test_photographs_are_turned_upright_once_and_copies_are_left_out(
+    pictures: list[np.ndarray], tmp_path: Path
+) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for i, picture in enumerate(pictures[::3]):
+        image = Image.fromarray(np.ascontiguousarray(np.rot90(picture)) if i == 4 else picture)
+        exif = image.getexif()
+        if i == 4:
+            exif[ORIENTATION] = 6
+        image.save(folder / f"p{i:02d}.jpg", quality=97, exif=exif)
+    (folder / "copy.jpg").write_bytes((folder / "p03.jpg").read_bytes())
+    (folder / "._p00.jpg").write_bytes(b"of a Mac")
+    told: list[str] = []
+    captured = capture(str(folder), tmp_path / "room", 150, 400, 2, lambda what, share: told.append(what))
+    assert captured.chosen == 14
+    assert captured.images == 14
+    assert captured.seen == 15
+    assert (captured.camera.width, captured.camera.height) == (400, 300)
+    truth = {f"p{i:02d}": pose for i, pose in enumerate(walk(40)[::3])} | {"copy": walk(40)[9]}
+    degrees, length = errors(tmp_path / "room", truth)
+    assert degrees < 0.5
+    assert length < 0.04
+    assert list(dict.fromkeys(told))[-1] == "writing the images"
+
+
+def test_what_cannot_be_mapped_is_told_and_nothing_written(tmp_path: Path) -> None:
+    grey = tmp_path / "grey"
+    grey.mkdir()
+    for i in range(10):
+        Image.fromarray(np.full((120, 160, 3), 100 + i, np.uint8)).save(grey / f"{i}.png")
+    with pytest.raises(DatasetError, match=r"only 0 of 10 .*too little texture.*newspaper"):
+        capture(str(grey), tmp_path / "out", 150, 400, 1)
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(SourceError, match="no images"):
+        capture(str(tmp_path), tmp_path / "out", 150, 400, 1)
+    with pytest.raises(SourceError, match="no such video"):
+        capture(str(tmp_path / "none.mp4"), tmp_path / "out", 150, 400, 1)
+    Image.fromarray(np.zeros((100, 160, 3), np.uint8)).save(grey / "other.png")
+    with pytest.raises(SourceError, match=r"several sizes \(160x100, 160x120\)"):
+        capture(str(grey), tmp_path / "out", 150, 400, 1)
+
+
+def test_few_images_are_refused(pictures: list[np.ndarray], tmp_path: Path) -> None:
+    for i, picture in enumerate(pictures[:4]):
+        Image.fromarray(picture).save(tmp_path / f"{i}.png")
+    ran = fieldpose("capture", tmp_path, "--out", tmp_path / "out", cwd=tmp_path)
+    assert ran.returncode == 2
+    assert "4 usable images, but at least 8 are needed" in ran.stderr
+    assert not (tmp_path / "out" / "images").exists()
+
+
+def test_images_without_a_place_are_named_with_the_reason(tmp_path: Path) -> None:
+    poses = cameras_before_a_wall(LENS, 12).cam_from_object
+    for i, pose in enumerate(poses):
+        Image.fromarray(photograph(LENS, pose)).save(tmp_path / f"p{i:02d}.png")
+    Image.fromarray(np.full((360, 480, 3), 90, np.uint8)).save(tmp_path / "wall.png")
+    noise = np.random.default_rng(0).integers(0, 256, (360, 480, 3)).astype(np.uint8)
+    Image.fromarray(cv2.GaussianBlur(noise, (0, 0), 1.0)).save(tmp_path / "z.png")
+    captured = capture(str(tmp_path), tmp_path / "out", 150, 480, 2)
+    assert captured.images == 12
+    assert captured.reasons["wall.jpg"] == TOO_LITTLE
+    assert captured.reasons["z.jpg"] == NO_OVERLAP
+    assert summary(captured.reasons) == f"1 {TOO_LITTLE}, 1 {NO_OVERLAP}"
+    assert advice({"a": TOO_LITTLE, "b": NO_OVERLAP, "c": NO_OVERLAP}).startswith("film the way")

@@ -21,7 +21,7 @@ from fieldpose.stages.camera.sources.folder import natural
 from fieldpose.stages.cores import usable_cores
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.images import decoded, shrunk
-from fieldpose.stages.nerf.datasets.images import EXTENSIONS, upright, upright_size
+from fieldpose.stages.nerf.datasets.images import EXTENSIONS, is_image_name, upright, upright_size
 from fieldpose.stages.nerf.datasets.transforms import FILE
 from fieldpose.stages.nerf.datasets.writing import transforms_document
 
@@ -298,7 +298,7 @@ def _photographs(folder: Path, size: int, report: Report) -> Shots:
 
     Those that stand where most lie, or the other way round, are turned by a quarter: one lens then has one camera.
     """
-    paths = sorted((p for p in folder.iterdir() if _is_image(p)), key=natural) if folder.is_dir() else []
+    paths = sorted((p for p in folder.iterdir() if is_image_name(p)), key=natural) if folder.is_dir() else []
     if not paths:
         raise SourceError(f"{folder}: no images in this folder; expected {', '.join(EXTENSIONS)}")
     shots: list[Shot] = []
@@ -329,10 +329,6 @@ def _check_shapes(folder: Path, shots: Sequence[Shot]) -> None:
         raise SourceError(
             f"{folder}: images of several sizes ({named}), so of several cameras; keep those of one camera"
         )
-
-
-def _is_image(path: Path) -> bool:
-    return path.suffix.lower() in EXTENSIONS and not path.name.startswith(".")
 
 
 def _frames(source: Source, most: int, size: int, report: Report) -> Shots:

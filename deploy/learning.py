@@ -82,16 +82,20 @@ def _examined(
     field: Field, images: Sequence[np.ndarray], matching: MatchingConfig, training: TrainingConfig, say: Say
 ) -> PoseAccuracy | None:
     """How well its own training images are found in it; None where the weights are missing."""
-    from fieldpose.deploy.evaluation.accuracy import pose_accuracy
+    from fieldpose.deploy.evaluation import accuracy
     from fieldpose.stages.nerf.loading import make_renderer
     from fieldpose.stages.nerf.training_views import training_views
 
     renderer = make_renderer(field, training.threads, training.backend)
     try:
-        return pose_accuracy(
+        found = accuracy.pose_accuracy(
             renderer, training_views(field), images, [view.camera for view in field.metadata.cameras],
             replace(Settings(), matching=matching),
         )  # fmt: skip
     except WeightsError as error:
         say(f"the field is not tried on its training images, and its covariances are not scaled: {error}")
         return None
+    if isinstance(found, PoseAccuracy):
+        return found
+    say(f"from the training view next to it, {accuracy.in_words(found)}")
+    return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -34,19 +34,27 @@ _SCALES = 0.25, 4.0
 _MOST, _LARGE = 0.8, 2.0
 
 
+@dataclass(frozen=True)
+class TooFew:
+    """So many of the images that were looked for were found, which is too few to tell how exactly."""
+
+    images: int
+    found: int
+
+
 def pose_accuracy(
     renderer: RayRenderer,
     views: TrainingViews,
     images: Sequence[np.ndarray],
     cameras: Sequence[Camera],
     settings: Settings,
-) -> PoseAccuracy | None:
+) -> PoseAccuracy | TooFew:
     """Find some of the training images (h, w, 3) uint8, of these cameras, from the views next to them, unrefined.
 
-    None where fewer than eight are found, which tells nothing. Raises ConfigError and WeightsError.
+    Raises ConfigError and WeightsError.
     """
     if len(views.names) < 2:
-        return None
+        return TooFew(len(views.names), 0)
     settings = replace(
         settings,
         refinement=replace(settings.refinement, when="never"),
@@ -66,15 +74,20 @@ def pose_accuracy(
         shifts.append(translation_error(found.cam_from_object, truth))
         distances.append(mahalanobis_squared(found.cam_from_object, found.covariance, truth))
     if len(turns) < _ENOUGH:
-        return None
+        return TooFew(len(chosen), len(turns))
     scale = _UNLEARNT * np.sqrt(np.quantile(distances, _LIKELY) / chi2.ppf(_LIKELY, 6))
     return PoseAccuracy(
         len(chosen), len(turns), float(np.median(turns)), float(np.median(shifts)), float(np.clip(scale, *_SCALES))
     )
 
 
-def in_words(accuracy: PoseAccuracy) -> str:
+def in_words(accuracy: PoseAccuracy | TooFew) -> str:
     """What it says of the field, and where it gives reason to doubt the dataset's poses, that too."""
+    if isinstance(accuracy, TooFew):
+        told = f"{accuracy.found} of {accuracy.images} training images are found"
+        if accuracy.found > _MOST * accuracy.images:
+            return f"{told}: all, or nearly, but too few to tell how exactly poses are found"
+        return f"{told}: are the dataset's poses, their axes and its camera right?"
     told = (
         f"the pose of a training image is found to {accuracy.rotation_deg:.2g} degrees and"
         f" {accuracy.translation:.2g} in the median, {accuracy.found} of {accuracy.images}"

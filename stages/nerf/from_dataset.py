@@ -30,6 +30,8 @@ GREY = (0.5, 0.5, 0.5)
 """Behind a field of all that the images show, where a ray ends in nothing."""
 BOUNDED_STEP, CONTRACTED_STEP = 2 / 384, 1 / 128
 CONTRACTED_FAR = 64.0
+FEW = 8
+"""Training images; with fewer a user is told."""
 EDGE = 1 / 16
 """How much a box of all that images show grows on each side, of its largest half: walls and floors often lie on its
 faces, and become opaque only over some steps: with 1 % a papered room is not learnt at all, with 3 % slowly."""
@@ -149,6 +151,8 @@ def train_field(
     dataset = load_dataset(path, "train", size, holdout=holdout)
     for note in dataset.notes:
         say(note)
+    if len(dataset) < FEW:
+        say(f"only {len(dataset)} training images: what two of them do not show from different sides is not learnt")
     fitted = fit(dataset)
     cameras = None if fitted is None else fitted.cameras
     if cameras is not None:

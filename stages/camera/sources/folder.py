@@ -14,7 +14,15 @@ from fieldpose.stages.camera.calibration import Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.images import shrunk_with_camera
-from fieldpose.stages.nerf.datasets.images import EXTENSIONS, ORIENTATION, WHITE, load_pixels, over_background, probe
+from fieldpose.stages.nerf.datasets.images import (
+    EXTENSIONS,
+    ORIENTATION,
+    WHITE,
+    is_image_name,
+    load_pixels,
+    over_background,
+    probe,
+)
 
 
 def open_folder(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
@@ -22,7 +30,7 @@ def open_folder(rest: str, config: CameraConfig, calibrator: Calibrator) -> Sour
     root = Path(rest)
     if not root.is_dir():
         raise SourceError(f"{root}: no such folder of images")
-    paths = sorted((path for path in root.iterdir() if path.suffix.lower() in EXTENSIONS), key=natural)
+    paths = sorted((path for path in root.iterdir() if is_image_name(path)), key=natural)
     if not paths:
         raise SourceError(f"{root}: no images in this folder; expected {', '.join(EXTENSIONS)}")
     told = calibrator.of(*_size(paths[0]), paths[0]).told

@@ -25,6 +25,6 @@ def read_blender(root: Path) -> Draft:
         if split in documents
         for record in read_records(file, documents[split], split, pixel_centre=0.0)
     ]
-    check_distinct(root / TEST_FILE, records)
+    check_distinct(f"{root / TRAIN_FILE} and {TEST_FILE}", records)
     train = documents["train"]
     return Draft("blender", records, train.aabb, train.object_aabb, train.metres_per_unit)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import json
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import msgspec
@@ -18,6 +19,13 @@ from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 RIGID_TOLERANCE = 1e-3
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+LFS_POINTER = "version https://git-lfs"
+NOT_OURS = frozenset({"scale", "offset", "aabb_scale", "ply_file_path", "applied_transform", "applied_scale", "time"})
+"""Keys that other programs write, alike to some of these files' own."""
+UNSUPPORTED = frozenset({"k5", "k6", "rolling_shutter", "lidar"})
+"""Keys that say what this reader has no model for, unless they say nothing."""
+_UNSUPPORTED_HOW = "undistort the images to a pinhole camera first, or take the key out if it means nothing"
+_MISSPELT = 0.74
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
@@ -49,7 +57,11 @@ class Document(Intrinsics, kw_only=True):
 def read_document(file: Path) -> Document:
     """Parse and check a file of frames. DatasetError if it is no such JSON or holds no frame."""
     try:
-        document = msgspec.convert(json.loads(file.read_text(encoding="utf-8")), Document)
+        text = file.read_text(encoding="utf-8-sig")
+        if text.startswith(LFS_POINTER):
+            raise DatasetError(f"{file}: a pointer of Git LFS instead of the file itself; fetch it by `git lfs pull`")
+        content = json.loads(text)
+        document = msgspec.convert(content, Document)
     except FileNotFoundError as error:
         raise DatasetError(f"{file}: no such file") from error
     except (OSError, ValueError, RecursionError) as error:
@@ -57,15 +69,49 @@ def read_document(file: Path) -> Document:
         raise DatasetError(f"{file}: {what} ({error}); export the dataset again") from error
     if not document.frames:
         raise DatasetError(f"{file}: it has no frames; export the dataset again")
+    check_keys(file, "", content, Document)
+    for i, frame in enumerate(content["frames"]):
+        check_keys(file, f"frame {i}: ", frame, Frame)
     _check_document(file, document)
     return document
 
 
+def check_keys(file: Path, where: str, content: Mapping[str, object], known: type[Intrinsics]) -> None:
+    """DatasetError for a key that is not known and whose name or number would change the cameras, were it known.
+
+    Other keys, which other programs write for themselves, are theirs.
+    """
+    names = {field.name for field in msgspec.structs.fields(known)}
+    for key in sorted(content.keys() - names - NOT_OURS):
+        meant = difflib.get_close_matches(key, sorted(names), 1, _MISSPELT)
+        if meant:
+            raise DatasetError(f"{file}: {where}{key!r} is no key of this file; is {meant[0]!r} meant?")
+    for key in sorted(UNSUPPORTED & content.keys()):
+        if content[key] not in (0, 0.0, None, [], False):
+            raise DatasetError(f"{file}: {where}{key} is {content[key]!r}, which is not supported; {_UNSUPPORTED_HOW}")
+
+
 def find_image(root: Path, file_path: str) -> Path | None:
-    """The image that a frame names, whose extension may be left out; None if there is none."""
-    path = root / file_path.replace("\\", "/")
+    """The image that a frame names; None if there is none.
+
+    Its extension may be left out, or differ in upper and lower case, and the path may begin in another folder than the
+    dataset's, as where a converter was run: then its longest end that leads to a file counts.
+    """
+    parts = PurePosixPath(file_path.replace("\\", "/")).parts
+    for first in range(len(parts)):
+        found = _image_at(root.joinpath(*parts[first:]))
+        if found is not None:
+            return found
+    return None
+
+
+def _image_at(path: Path) -> Path | None:
     candidates = (path, *(path.with_name(path.name + extension) for extension in EXTENSIONS))
-    return next((candidate for candidate in candidates if candidate.is_file()), None)
+    found = next((candidate for candidate in candidates if candidate.is_file()), None)
+    if found is None and path.parent.is_dir():
+        wanted = {candidate.name.lower() for candidate in candidates}
+        found = next((p for p in sorted(path.parent.iterdir()) if p.name.lower() in wanted and p.is_file()), None)
+    return found
 
 
 def read_records(
@@ -86,7 +132,7 @@ def read_records(
     return records
 
 
-def check_distinct(file: Path, records: Sequence[ImageRecord]) -> None:
+def check_distinct(file: Path | str, records: Sequence[ImageRecord]) -> None:
     """DatasetError if one image is listed twice."""
     seen: set[str] = set()
     for record in records:
@@ -158,9 +204,9 @@ def _record(
 ) -> ImageRecord:  # fmt: skip
     where = f"{file}: frame {frame.file_path}"
     depth_path = _companion(file, frame.depth_file_path)
-    depth_scale = frame.depth_scale or document.depth_scale
-    if depth_path is not None and not (depth_scale is not None and 0 < depth_scale < np.inf):
-        raise DatasetError(f"{where}: a depth file needs depth_scale, the length of one step, as a positive number")
+    depth_scale = frame.depth_scale if frame.depth_scale is not None else document.depth_scale
+    if depth_scale is not None and not 0 < depth_scale < np.inf:
+        raise DatasetError(f"{where}: depth_scale, the length of one step, must be positive, got {depth_scale}")
     return ImageRecord(
         name=relative_name(file.parent, path),
         path=path,
@@ -168,7 +214,7 @@ def _record(
         cam_from_object=OPENCV_FROM_OPENGL @ inverse(checked_rigid(_matrix(frame, where), where)),
         split=split,
         depth_path=depth_path,
-        depth_scale=depth_scale or 1.0,
+        depth_scale=depth_scale,
         mask_path=_companion(file, frame.mask_file_path or frame.mask_path),
     )
 

@@ -34,6 +34,11 @@ class ImageHeader:
     has_alpha: bool
 
 
+def is_image_name(path: Path) -> bool:
+    """Whether a file is one of a folder's images by its name; hidden ones are not, as zips made on a Mac have them."""
+    return path.suffix.lower() in EXTENSIONS and not path.name.startswith(".")
+
+
 def probe(path: Path) -> ImageHeader:
     """Read the header of an image file. DatasetError if it is missing or no image."""
     return _read(path, lambda image: ImageHeader(image.width, image.height, _has_alpha(image)))

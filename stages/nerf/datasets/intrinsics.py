@@ -11,6 +11,8 @@ from fieldpose.errors import DatasetError, GeometryError
 from fieldpose.stages.geometry.cameras import Camera
 from fieldpose.stages.nerf.datasets.images import ImageHeader
 
+_NARROWEST_DEG, _WIDEST_DEG = 1.0, 170.0
+"""Of a photograph: the longest tele lenses see 2 degrees, and a pinhole camera's images are useless beyond 150."""
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
 
 
@@ -52,6 +54,7 @@ def camera_of(document: Intrinsics, frame: Intrinsics, header: ImageHeader, pixe
     try:
         camera = Camera(header.width, header.height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
         _check_invertible(camera)
+        _check_field_of_view(camera)
     except GeometryError as error:
         raise DatasetError(f"{where}: {error}") from error
     return camera
@@ -88,6 +91,16 @@ def _focal_length(focal: float | None, angle: float | None, pixels: int, where: 
     if not 0 < angle < math.pi:
         raise DatasetError(f"{where}: camera_angle must lie between 0 and pi radians, got {angle}")
     return 0.5 * pixels / math.tan(0.5 * angle)
+
+
+def _check_field_of_view(camera: Camera) -> None:
+    for focal, pixels, name in ((camera.fx, camera.width, "across"), (camera.fy, camera.height, "down")):
+        angle = math.degrees(2 * math.atan(pixels / 2 / focal))
+        if not _NARROWEST_DEG <= angle <= _WIDEST_DEG:
+            raise GeometryError(
+                f"a focal length of {focal:g} px sees {angle:.3g} degrees {name} {pixels} px; is it of these images,"
+                " and in pixels?"
+            )
 
 
 def _check_invertible(camera: Camera) -> None:

@@ -13,7 +13,7 @@ from fieldpose.stages.geometry.cameras import Camera
 from fieldpose.stages.geometry.rigid import from_rotation, inverse
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
 from fieldpose.stages.nerf.datasets.frames import OPENCV_FROM_OPENGL, checked_rigid, relative_name
-from fieldpose.stages.nerf.datasets.images import EXTENSIONS, probe
+from fieldpose.stages.nerf.datasets.images import is_image_name, probe
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 FILE = "poses_bounds.npy"
@@ -117,7 +117,7 @@ def _choose_folder(root: Path, hwf: np.ndarray, downscale: int | None, size: int
 
 
 def _image_paths(folder: Path) -> list[Path]:
-    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in EXTENSIONS)
+    paths = sorted(path for path in folder.iterdir() if is_image_name(path))
     if not paths:
         raise DatasetError(f"{folder}: it has no images; put the images of {FILE} there")
     return paths

@@ -37,7 +37,7 @@ class ImageRecord:
     near: float | None = None
     far: float | None = None
     depth_path: Path | None = None
-    depth_scale: float = 1.0
+    depth_scale: float | None = None
     mask_path: Path | None = None
 
 
@@ -98,6 +98,8 @@ class Dataset:
         record = self.images[index]
         if record.depth_path is None:
             raise DatasetError(f"{record.path}: the dataset has no depth for this image")
+        if record.depth_scale is None:
+            raise DatasetError(f"{record.depth_path}: the dataset has no depth_scale, the length of one of its steps")
         return images.load_depth(record.depth_path, record.camera.width, record.camera.height, record.depth_scale)
 
     def load_mask(self, index: int) -> np.ndarray:

@@ -24,8 +24,9 @@ def read_transforms(root: Path, holdout: Holdout | None) -> Draft:
     file = root / FILE
     document = read_document(file)
     notes = _leave_out_deleted(file, document)
-    records = sorted(read_records(file, document, "train", pixel_centre=0.5), key=lambda record: record.name)
-    records = _split(file, document, records, "odd" if holdout == "auto" else holdout)
+    records = _split(
+        file, document, read_records(file, document, "train", pixel_centre=0.5), "odd" if holdout == "auto" else holdout
+    )
     return Draft("transforms", records, document.aabb, document.object_aabb, document.metres_per_unit, notes=notes)
 
 
@@ -45,17 +46,19 @@ def _leave_out_deleted(file: Path, document: Document) -> tuple[str, ...]:
 
 def _split(file: Path, document: Document, records: list[ImageRecord], holdout: Holdout | None) -> list[ImageRecord]:
     train, test = document.train_filenames, document.test_filenames or document.val_filenames
+    ordered = sorted(records, key=lambda record: record.name)
     if train is None and test is None:
-        return [replace(record, split=split_of(i, holdout)) for i, record in enumerate(records)]
+        return [replace(record, split=split_of(i, holdout)) for i, record in enumerate(ordered)]
     wanted: dict[str, Literal["train", "test"]] = dict.fromkeys(map(_plain, train or ()), "train")
     wanted |= dict.fromkeys(map(_plain, test or ()), "test")
     unknown = sorted(wanted.keys() - {_plain(frame.file_path) for frame in document.frames})
     if unknown:
         raise DatasetError(f"{file}: {unknown[0]} is in a split but has no frame; take it out or add its frame")
-    by_name = {_plain(record.name): record for record in records}
+    by_name = {_plain(frame.file_path): record for frame, record in zip(document.frames, records, strict=True)}
+    by_name |= {_plain(record.name): record for record in records}
     by_stem = {str(PurePosixPath(name).with_suffix("")): record for name, record in by_name.items()}
     listed = {(by_name.get(name) or by_stem[name]).name: split for name, split in wanted.items()}
-    return [replace(record, split=listed[record.name]) for record in records if record.name in listed]
+    return [replace(record, split=listed[record.name]) for record in ordered if record.name in listed]
 
 
 def _plain(file_path: str) -> str:

@@ -99,7 +99,20 @@ BLENDER: dict[str, tuple[Break, str]] = {
         frame(TRAIN, depth_file_path="d.png", depth_scale=1),
         r"d\.png: no such file, but transforms_tr",
     ),
-    "depth without scale": (frame(TRAIN, depth_file_path="train/r_1.png"), r"frame \./train/r_1: .*depth_scale"),
+    "depth of no length": (
+        frame(TRAIN, depth_file_path="train/r_1.png", depth_scale=-1),
+        r"frame \./train/r_1: .*depth_scale",
+    ),
+    "misspelt key": (whole(TRAIN, f1_x=100.0), r"train\.json: 'f1_x' is no key of this file; is 'fl_x' meant\?"),
+    "misspelt key of a frame": (frame(TRAIN, transform_matrx=[]), r"frame 1: 'transform_matrx' .*'transform_matrix'"),
+    "rational lens": (whole(TRAIN, k5=0.01), r"train\.json: k5 is 0\.01, which is not supported"),
+    "rolling shutter": (frame(TRAIN, rolling_shutter=[0.1, 0, 0]), r"frame 1: rolling_shutter is \[0\.1, 0, 0\]"),
+    "absurd focal length": (whole(TRAIN, fl_x=1e5), r"train\.json: frame .*100000 px sees .* degrees across 80 px"),
+    "absurdly short one": (whole(TRAIN, fl_x=0.9), r"train\.json: frame .*0\.9 px sees 177 degrees"),
+    "pointer of Git LFS": (
+        lambda r: text(r / TRAIN, "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"),
+        r"train\.json: a pointer of Git LFS instead of the file itself; fetch it by `git lfs pull`",
+    ),
     "missing mask": (frame(TRAIN, mask_file_path="m.png"), r"m\.png: no such file, but transforms_train\.json"),
 }
 TRANSFORMS_JSON: dict[str, tuple[Break, str]] = {

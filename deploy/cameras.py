@@ -52,6 +52,11 @@ def fit_cameras(
 def in_words(fit: CameraFit, unit: str) -> str:
     """A line on how cameras fit, or how they were moved, or why not."""
     images = f"(in images of {fit.size_px} px)"
+    if fit.reading is not None:
+        return (
+            "cameras do not fit their images: poses are read as object_from_cam in OpenGL's camera axes (x right, y up,"
+            f" z back), but these would fit as {fit.reading}; write them in the former"
+        )
     if fit.before_px is None or fit.after_px is None:
         return (
             f"whether the cameras fit their images is not known: {len(fit.kept)} images share too little with others;"
@@ -94,6 +99,7 @@ def _record(dataset: Dataset, given: PosedCameras, mending: Mending) -> CameraFi
         after_px=mending.after_px,
         rotation_deg=_pair(mending.rotation_deg),
         translation=_pair(mending.translation),
+        reading=mending.reading,
         kept=tuple(name for name, alone in zip(names, mending.unsupported, strict=True) if alone),
     )
 

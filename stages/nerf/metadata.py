@@ -76,7 +76,8 @@ class CameraFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     kept. before_px and after_px: median distance of points from where they are seen, by the given cameras and by
     adjusted ones, in images whose longer side has size_px. rotation_deg and translation (object units): median and most
     of what the poses were changed by. focal_px: in the median of the images, at the size of their files, before and
-    after. kept: images that share too little with others, whose cameras stayed.
+    after. kept: images that share too little with others, whose cameras stayed. reading: what the poses in the files
+    were meant to be, where they do not fit as object_from_cam in OpenGL's camera axes but would so.
     """
 
     verdict: Literal["fit", "adjusted", "too few", "no fit"]
@@ -87,6 +88,7 @@ class CameraFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     rotation_deg: tuple[float, float] | None = None
     translation: tuple[float, float] | None = None
     kept: tuple[str, ...] = ()
+    reading: str | None = None
 
 
 class FieldMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -19,6 +19,7 @@ from fieldpose.stages.geometry import camera_centres, rotation_error_deg
 from fieldpose.stages.geometry.arrays import Flags, Values
 from fieldpose.stages.structure.adjustment import MEDIAN_LENGTH, adjust, supported
 from fieldpose.stages.structure.colmap import Freedom, can_bend
+from fieldpose.stages.structure.conventions import fitting_reading
 from fieldpose.stages.structure.features import Keypoints, find_keypoints
 from fieldpose.stages.structure.matches import match_pairs
 from fieldpose.stages.structure.pairs import choose_pairs
@@ -71,7 +72,7 @@ class Mending:
     held-out points from their pixels, by the given cameras and the adjusted ones, in images whose longer side has
     `size_px` pixels; None where too few are shared. rotation_deg and translation (object units): how far adjusted
     cameras are from the given ones, both in the given frame. unsupported: images that stay as given since they share
-    too little.
+    too little. reading: how the poses were meant, where none fit as they were read and would otherwise.
     """
 
     verdict: Verdict
@@ -83,6 +84,7 @@ class Mending:
     after_px: float | None = None
     rotation_deg: Spread | None = None
     translation: Spread | None = None
+    reading: str | None = None
 
 
 def mend(
@@ -100,19 +102,26 @@ def mend(
     """
     small = PosedCameras(tuple(camera.shrunk(LONGER_SIDE) for camera in given.cameras), given.cam_from_object)
     threads = threads or usable_cores()
-    tracks = find_tracks(small, load, threads, report)
+    keypoints = _find_keypoints(small, load, threads, report)
+    pairs = choose_pairs(small.cam_from_object)
+    matches = match_pairs(keypoints, pairs, threads, lambda share: report("matching the images", share))
+    tracks = join_tracks(keypoints, pairs, matches)
     report("adjusting the cameras", 0.0)
     trained_px = trained_px or _longest(given)
-    return _at_full_size(mend_by_tracks(small, tracks, min(trained_px, _longest(given)), threads), given)
+    mending = _at_full_size(mend_by_tracks(small, tracks, min(trained_px, _longest(given)), threads), given)
+    if mending.verdict in ("fit", "adjusted"):
+        return mending
+    trying = "trying other axes"
+    return replace(mending, reading=fitting_reading(small, keypoints, threads, lambda share: report(trying, share)))
 
 
-def find_tracks(
+def _find_keypoints(
     posed: PosedCameras,
     load: Callable[[int, int, int], np.ndarray],
     threads: int,
     report: Callable[[str, float], None],
-) -> Tracks:
-    """What images, at the sizes of their cameras, share with those near to them."""
+) -> list[Keypoints]:
+    """Of images at the sizes of their cameras."""
 
     def found(index: int) -> Keypoints:
         camera = posed.cameras[index]
@@ -123,9 +132,7 @@ def find_tracks(
         for points in pool.map(found, range(len(posed))):
             keypoints.append(points)
             report("looking for points in the images", len(keypoints) / len(posed))
-    pairs = choose_pairs(posed.cam_from_object)
-    matches = match_pairs(keypoints, pairs, threads, lambda share: report("matching the images", share))
-    return join_tracks(keypoints, pairs, matches)
+    return keypoints
 
 
 def mend_by_tracks(given: PosedCameras, tracks: Tracks, trained_px: float, threads: int = 1) -> Mending:

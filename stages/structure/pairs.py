@@ -60,6 +60,8 @@ def _apart(cam_from_object: Transforms) -> np.ndarray:
 
 def alike_pairs(keypoints: Sequence[Keypoints], partners: int) -> list[tuple[int, int]]:
     """Pairs (i, j), i < j, sorted: for each image those that look most like it, by their descriptors."""
+    if sum(map(len, keypoints)) < _WORDS:
+        return []
     signatures = _signatures([root(found.descriptors) for found in keypoints])
     alike = signatures @ signatures.T
     np.fill_diagonal(alike, -np.inf)
@@ -71,11 +73,10 @@ def _signatures(descriptors: Sequence[np.ndarray]) -> np.ndarray:
     """(n, words * 128), of length 1 each: how an image's descriptors differ from the words that are nearest to them."""
     everything = np.concatenate(descriptors)
     some = everything[np.random.default_rng(0).permutation(len(everything))[:_SAMPLE]]
-    words = min(_WORDS, len(some))
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER | cv2.TERM_CRITERIA_EPS, 20, 1e-4)
-    _, _, centres = cv2.kmeans(some, words, None, criteria, 1, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
-    result = np.zeros((len(descriptors), words, everything.shape[1]), np.float32)
+    _, _, centres = cv2.kmeans(some, _WORDS, None, criteria, 1, cv2.KMEANS_PP_CENTERS)  # type: ignore[call-overload]
+    result = np.zeros((len(descriptors), _WORDS, everything.shape[1]), np.float32)
     for signature, own in zip(result, descriptors, strict=True):
         nearest = (own @ centres.T - 0.5 * (centres**2).sum(axis=1)).argmax(axis=1)
         np.add.at(signature, nearest, own - centres[nearest])

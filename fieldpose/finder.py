@@ -46,7 +46,8 @@ class PoseFinder:
     ) -> PoseFound:
         """The pose of an image, or the reason why there is none.
 
-        image: (h, w, 3) uint8 RGB, or an image file, whose EXIF may tell of its lens. camera: of the image; without it
+        image: (h, w, 3) uint8 RGB, or an image file, whose EXIF may tell of its lens and how it is to be turned; with a
+        camera it is taken as it is stored. camera: of the image; without it
         the training views' camera where the shape is theirs, else EXIF's focal length, else an assumed field of view,
         by which no pose is sure (`state` is LIMITED and the covariance large). guess: a cam_from_object (4, 4) to begin
         with; without it, the training views that look like the image. Raises FieldposeError for what is no image, or
@@ -54,12 +55,14 @@ class PoseFinder:
         """
         if guess is not None and not is_rigid(guess, RIGID_TOLERANCE):
             raise GeometryError(f"a guess must be a rigid (4, 4) cam_from_object, got {np.asarray(guess).tolist()}")
-        path = None if isinstance(image, np.ndarray) else Path(image)
+        if not isinstance(image, np.ndarray) and camera is None:
+            pixels, calibration = self._calibrator.photo(Path(image))
+            return self._finder.find(pixels, calibration.camera, guess, calibration.origin)
         pixels = image if isinstance(image, np.ndarray) else load_photo(Path(image))
         checked_image(pixels)
         if camera is not None:
             return self._finder.find(pixels, camera, guess, CameraOrigin.CALIBRATED)
-        calibration = self._calibrator.of(pixels.shape[1], pixels.shape[0], path)
+        calibration = self._calibrator.of(pixels.shape[1], pixels.shape[0])
         return self._finder.find(pixels, calibration.camera, guess, calibration.origin)
 
     def close(self) -> None:

@@ -47,7 +47,7 @@ class Options:
     guess: str | None = None
     """Where to begin: train:NAME (the pose of a training view), or a JSON file {"cam_from_object": 4x4 by rows}."""
     camera_file: Path | None = None
-    """JSON file of the camera (short for --camera.camera-file); without it the camera that the training views were
+    """File of the camera, JSON or as ROS, OpenCV, Kalibr or COLMAP write it (short for --camera.camera-file); without it the camera that the training views were
     taken with, where the image has its shape, else what the image says of its focal length."""
     json: Path | None = None
     """Write the result into this file."""
@@ -103,11 +103,7 @@ class Options:
 
     def _image(self, known: Sequence[Camera], config: CameraConfig) -> tuple[np.ndarray, Calibration]:
         """The pixels (h, w, 3) uint8 and the camera. Raises DatasetError and SourceError."""
-        from fieldpose.stages.nerf.datasets.images import load_photo
-
-        image = load_photo(self.image)
-        height, width = image.shape[:2]
-        calibration = Calibrator(config, known).of(width, height, self.image)
+        image, calibration = Calibrator(config, known).photo(self.image)
         image, camera = shrunk_with_camera(image, calibration.camera, config.size)
         return image, replace(calibration, camera=camera)
 

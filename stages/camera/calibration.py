@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
+import numpy as np
 from PIL import Image
 
 from fieldpose.bus.messages import CameraOrigin
-from fieldpose.errors import FieldposeError, SourceError
+from fieldpose.errors import SourceError
+from fieldpose.stages.camera.camera_files import read_camera_file
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.geometry import Camera
+from fieldpose.stages.nerf.datasets.images import load_photo, orientation, probe, upright, upright_size
 
 _EXIF_IFD = 0x8769
 _FOCAL_LENGTH_35MM = 0xA405
@@ -61,23 +63,31 @@ class Calibrator:
         told = f"assumed field of view of {fov_deg:g} degrees; give --camera.camera-file"
         return Calibration(_centred(width, height, focal), CameraOrigin.ASSUMED, told)
 
+    def photo(self, path: Path) -> tuple[np.ndarray, Calibration]:
+        """The pixels (h, w, 3) uint8 of a photograph and its camera. Raises DatasetError and SourceError as of() does.
+
+        It is turned as its EXIF says, unless it has the shape of a known camera only as it is stored, as photographs do
+        whose poses were found without a look at that.
+        """
+        image = upright(path) if self.turns(path) else load_photo(path)
+        return image, self.of(image.shape[1], image.shape[0], path)
+
+    def turns(self, path: Path) -> bool:
+        """Whether photo() turns that photograph. Raises DatasetError and SourceError."""
+        header, turned = probe(path), upright_size(path)
+        if orientation(path) == 1:
+            return False
+        return self._fits(*turned) or not self._fits(header.width, header.height)
+
+    def _fits(self, width: int, height: int) -> bool:
+        file = self._config.camera_file
+        cameras = self._known if file is None else (read_camera_file(file),)
+        return any(_same_shape(camera, width, height) for camera in cameras)
+
     def _trained(self, width: int, height: int) -> Camera | None:
         """The training camera of that shape, at that size; of several the one of median focal length."""
         shaped = [camera.resized(width, height) for camera in self._known if _same_shape(camera, width, height)]
         return sorted(shaped, key=lambda camera: camera.fx)[len(shaped) // 2] if shaped else None
-
-
-def read_camera_file(path: Path) -> Camera:
-    """Read a JSON file of width, height, fx, fy, cx, cy and, if there is any, distortion. Raises SourceError."""
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=Camera)
-    except FileNotFoundError:
-        raise SourceError(f"{path}: no such camera file") from None
-    except (OSError, msgspec.DecodeError, FieldposeError) as error:
-        raise SourceError(
-            f"{path}: no usable camera file ({error}); it needs width, height, fx, fy, cx, cy in pixels, and may"
-            " have distortion as [k1, k2, p1, p2, k3]"
-        ) from error
 
 
 def focal_length_from_exif(path: Path, width: int, height: int) -> float | None:

@@ -43,7 +43,13 @@ class FollowingConfig:
             "following",
             self,
             {
-                "landmarks": 8, "views": 1, "budget": 0, "ahead": 0, "solve_ms": 0, "fresh_deg": 0, "lost_after": 1,
+                "landmarks": 8,
+                "views": 1,
+                "budget": 0,
+                "ahead": 0,
+                "solve_ms": 0,
+                "fresh_deg": 0,
+                "lost_after": 1,
                 "weak_after": 1,
             },
         )

@@ -14,7 +14,7 @@ from support.papered_room import cameras_before_a_wall, photograph
 
 from fieldpose.deploy.capturing import CAMERA_FILE, NO_OVERLAP, TOO_LITTLE, advice, capture, summary
 from fieldpose.errors import DatasetError, SourceError
-from fieldpose.stages.camera.calibration import read_camera_file
+from fieldpose.stages.camera.camera_files import read_camera_file
 from fieldpose.stages.geometry import Camera, camera_centres, look_at, rotation_error_deg
 from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.structure.similarity import align

@@ -10,19 +10,11 @@ import numpy as np
 from PIL import Image
 
 from fieldpose.errors import DatasetError, SourceError
-from fieldpose.stages.camera.calibration import Calibrator
+from fieldpose.stages.camera.calibration import Calibration, Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.images import shrunk_with_camera
-from fieldpose.stages.nerf.datasets.images import (
-    EXTENSIONS,
-    ORIENTATION,
-    WHITE,
-    is_image_name,
-    load_pixels,
-    over_background,
-    probe,
-)
+from fieldpose.stages.nerf.datasets.images import EXTENSIONS, is_image_name, orientation, probe
 
 
 def open_folder(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
@@ -33,11 +25,11 @@ def open_folder(rest: str, config: CameraConfig, calibrator: Calibrator) -> Sour
     paths = sorted((path for path in root.iterdir() if is_image_name(path)), key=natural)
     if not paths:
         raise SourceError(f"{root}: no images in this folder; expected {', '.join(EXTENSIONS)}")
-    told = calibrator.of(*_size(paths[0]), paths[0]).told
+    told = _read(0, paths[0], config, calibrator)[1].told
 
     def frames(first: int) -> Iterator[CapturedFrame]:
         for i, path in enumerate(paths[first:], first):
-            yield _read(i, path, config, calibrator)
+            yield _read(i, path, config, calibrator)[0]
 
     return Source(f"{len(paths)} images of {root}, {told}", "none", frames, len(paths))
 
@@ -48,30 +40,25 @@ def natural(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
 
 
-def _read(frame_id: int, path: Path, config: CameraConfig, calibrator: Calibrator) -> CapturedFrame:
-    width, height = _size(path)
-    calibration = calibrator.of(width, height, path)
-    camera, origin = calibration.camera, calibration.origin
-    if _can_stay_encoded(path) and (config.size is None or max(width, height) <= config.size):
-        encoded = np.frombuffer(path.read_bytes(), np.uint8)
-        return CapturedFrame(frame_id, encoded, "jpeg", camera, path.name, origin=origin)
+def _read(frame_id: int, path: Path, config: CameraConfig, calibrator: Calibrator) -> tuple[CapturedFrame, Calibration]:
     try:
-        pixels = over_background(load_pixels(path, width, height, probe(path).has_alpha), WHITE)
-    except DatasetError as error:
+        if _can_stay_encoded(path, config.size):
+            header = probe(path)
+            calibration = calibrator.of(header.width, header.height, path)
+            encoded = np.frombuffer(path.read_bytes(), np.uint8)
+            frame = CapturedFrame(frame_id, encoded, "jpeg", calibration.camera, path.name, origin=calibration.origin)
+            return frame, calibration
+        pixels, calibration = calibrator.photo(path)
+    except (DatasetError, OSError) as error:
         raise SourceError(str(error)) from error
-    image, camera = shrunk_with_camera(pixels, camera, config.size)
-    return CapturedFrame(frame_id, image, "rgb8", camera, path.name, origin=origin)
+    image, camera = shrunk_with_camera(pixels, calibration.camera, config.size)
+    return CapturedFrame(frame_id, image, "rgb8", camera, path.name, origin=calibration.origin), calibration
 
 
-def _size(path: Path) -> tuple[int, int]:
-    try:
-        header = probe(path)
-    except DatasetError as error:
-        raise SourceError(str(error)) from error
-    return header.width, header.height
-
-
-def _can_stay_encoded(path: Path) -> bool:
-    """An RGB JPEG that no decoder turns: EXIF orientation is ignored here, as it is in datasets."""
+def _can_stay_encoded(path: Path, size: int | None) -> bool:
+    """An RGB JPEG, small enough, that no decoder turns."""
+    header = probe(path)
+    if orientation(path) != 1 or (size is not None and max(header.width, header.height) > size):
+        return False
     with Image.open(path) as image:
-        return image.format == "JPEG" and image.mode == "RGB" and image.getexif().get(ORIENTATION, 1) == 1
+        return image.format == "JPEG" and image.mode == "RGB"

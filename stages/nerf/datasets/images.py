@@ -17,6 +17,7 @@ EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 ORIENTATION = 0x0112
 """EXIF's number for it; from 5 on width and height change places."""
 _FIRST_ACROSS = 5
+_SIXTEEN_BITS = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 Colour = tuple[int, int, int]
 WHITE: Colour = (255, 255, 255)
 PLAIN_WITHIN, PLAIN_SHARE, PLAIN_BORDER = 6, 0.95, 0.02
@@ -50,7 +51,7 @@ def load_pixels(path: Path, width: int, height: int, alpha: bool) -> np.ndarray:
     EXIF orientation is ignored, as it is by the programs that solve for the poses. DatasetError if the file is
     missing, truncated or no image.
     """
-    pixels = _read(path, lambda image: np.array(image.convert("RGBA" if alpha else "RGB")))
+    pixels = _read(path, lambda image: _colours(image, alpha))
     return _resize_rgba(pixels, width, height) if alpha else _resize(pixels, width, height)
 
 
@@ -114,10 +115,15 @@ def upright(path: Path) -> np.ndarray:
     """
 
     def turned(image: Image.Image) -> np.ndarray:
-        pixels = ImageOps.exif_transpose(image)
-        return over_background(np.array(pixels.convert("RGBA" if _has_alpha(image) else "RGB")), WHITE)
+        return over_background(_colours(ImageOps.exif_transpose(image), _has_alpha(image)), WHITE)
 
     return _read(path, turned)
+
+
+def orientation(path: Path) -> int:
+    """The EXIF orientation of an image file, 1 to 8; 1: as it is stored, and where it says nothing. DatasetError."""
+    stated = _read(path, lambda image: image.getexif().get(ORIENTATION, 1))
+    return int(stated) if stated in range(1, 9) else 1
 
 
 def upright_size(path: Path) -> tuple[int, int]:
@@ -139,6 +145,14 @@ def _read(path: Path, use: Callable[[Image.Image], _Result]) -> _Result:
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         reason = "not an image" if isinstance(error, Image.UnidentifiedImageError) else error
         raise DatasetError(f"{path}: cannot be read ({reason}); restore the file, or leave it out") from error
+
+
+def _colours(image: Image.Image, alpha: bool) -> np.ndarray:
+    """(h, w, 4 if alpha else 3) uint8; grey values of 16 bits are scaled, which PIL would cut off."""
+    if image.mode in _SIXTEEN_BITS:
+        levels = np.clip(np.asarray(image).astype(np.float32), 0, 65535) / 257
+        image = Image.fromarray(np.rint(levels).astype(np.uint8))
+    return np.array(image.convert("RGBA" if alpha else "RGB"))
 
 
 def _load_array(path: Path) -> np.ndarray:
@@ -178,6 +192,9 @@ def _resize_nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:
 
 
 def load_photo(path: Path) -> np.ndarray:
-    """The pixels (h, w, 3) uint8 RGB of an image file, transparent parts laid over white. Raises DatasetError."""
+    """The pixels (h, w, 3) uint8 RGB of an image file as they are stored, transparent parts laid over white.
+
+    Raises DatasetError.
+    """
     header = probe(path)
     return over_background(load_pixels(path, header.width, header.height, header.has_alpha), WHITE)

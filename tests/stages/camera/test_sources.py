@@ -85,10 +85,36 @@ def with_exif(path: Path, tag: int, value: int, ifd: int | None = None) -> None:
     Image.fromarray(shade(5)).save(path, exif=exif)
 
 
-def test_a_turned_jpeg_is_decoded_without_turning_it(tmp_path: Path) -> None:
-    with_exif(tmp_path / "turned.jpg", 0x0112, 6)
-    frame = frames_of(f"folder:{tmp_path}")[0]
-    assert (frame.encoding, frame.image.shape) == ("rgb8", (32, 48, 3))
+def corner(frame: CapturedFrame) -> tuple[int, int]:
+    """Row and column of the brightest pixel."""
+    image = decoded(frame).astype(int).sum(axis=2)
+    row, column = np.unravel_index(int(image.argmax()), image.shape)
+    return int(row), int(column)
+
+
+@pytest.mark.parametrize(("known", "turned"), [(None, True), ((64, 96), True), ((96, 64), False)])
+def test_a_photo_is_turned_as_exif_says_but_where_only_its_stored_shape_is_known(
+    tmp_path: Path, known: tuple[int, int] | None, turned: bool
+) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    pixels = shade(5)
+    pixels[2:5, 3:6] = 255
+    Image.fromarray(pixels).save(tmp_path / "turned.png", exif=exif)
+    cameras = [] if known is None else [Camera(*known, 80.0, 80.0, (known[0] - 1) / 2, (known[1] - 1) / 2)]
+    frame = next(open_source(CameraConfig(f"folder:{tmp_path}"), cameras).frames(0))
+    assert frame.image.shape == ((48, 32, 3) if turned else (32, 48, 3))
+    assert (frame.camera.width, frame.camera.height) == frame.image.shape[1::-1]
+    assert corner(frame) == ((3, 27) if turned else (2, 3))
+    assert (frame.origin is CameraOrigin.TRAINING) == (known is not None)
+
+
+def test_grey_values_of_sixteen_bits_are_scaled(tmp_path: Path) -> None:
+    levels = np.linspace(0, 65535, 48 * 32).reshape(32, 48).astype(np.uint16)
+    Image.fromarray(levels).save(tmp_path / "deep.png")
+    image = frames_of(f"folder:{tmp_path}")[0].image
+    np.testing.assert_allclose(image[..., 0], levels / 257, atol=0.51)
+    assert (image[..., 0] == image[..., 2]).all()
 
 
 def test_the_focal_length_comes_from_exif_then_from_the_field_of_view(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from fieldpose.stages.nerf.datasets import Dataset, PosedCamera, load_dataset
-from fieldpose.stages.nerf.datasets.images import load_pixels, probe
+from fieldpose.stages.nerf.datasets.images import load_mask, load_pixels, probe
 from fieldpose.stages.nerf.from_dataset import FittedCameras
 from fieldpose.stages.nerf.metadata import CameraFit
 
@@ -40,7 +40,13 @@ def fit_cameras(
     dataset = load_dataset(dataset.root, "all", LONGER_SIDE, holdout=holdout)
 
     def load(index: int, width: int, height: int) -> np.ndarray:
-        return load_pixels(dataset.images[index].path, width, height, dataset.has_alpha)
+        record = dataset.images[index]
+        pixels = load_pixels(record.path, width, height, dataset.has_alpha)
+        if record.learnt_path is None:
+            return pixels
+        learnt = np.where(load_mask(record.learnt_path, width, height), 255, 0).astype(np.uint8)
+        alpha = learnt if not dataset.has_alpha else np.minimum(learnt, pixels[..., 3])
+        return np.dstack([pixels[..., :3], alpha])
 
     given = PosedCameras(
         tuple(record.camera for record in dataset.images), np.stack([r.cam_from_object for r in dataset.images])

@@ -47,8 +47,9 @@ class Options:
     guess: str | None = None
     """Where to begin: train:NAME (the pose of a training view), or a JSON file {"cam_from_object": 4x4 by rows}."""
     camera_file: Path | None = None
-    """File of the camera, JSON or as ROS, OpenCV, Kalibr or COLMAP write it (short for --camera.camera-file); without it the camera that the training views were
-    taken with, where the image has its shape, else what the image says of its focal length."""
+    """File of the camera, JSON or as ROS, OpenCV, Kalibr or COLMAP write it (short for --camera.camera-file); without
+    it the camera that the training views were taken with, where the image has its shape, else what the image says of
+    its focal length."""
     json: Path | None = None
     """Write the result into this file."""
     overlay: Path | None = None

@@ -22,8 +22,9 @@ class CameraConfig:
     holdout: Literal["auto", "odd", "every8"] = "auto"
     """Which images of a dataset without splits of its own are the test images."""
     camera_file: Path | None = None
-    """The camera of a folder's, video's or device's images: JSON with width, height, fx, fy, cx, cy and distortion (k1 k2
-    p1 p2 k3), or a calibration of ROS, OpenCV, Kalibr or COLMAP (cameras.txt); without it the focal length is taken from the image's EXIF, or from fov_deg."""
+    """The camera of a folder's, video's or device's images: JSON with width, height, fx, fy, cx, cy and distortion (k1
+    k2 p1 p2 k3), or a calibration of ROS, OpenCV, Kalibr or COLMAP (cameras.txt); without it the focal length is taken
+    from the image's EXIF, or from fov_deg."""
     fov_deg: float = 60.0
     """Field of view along the longer side, where nothing better is known."""
     pace: Pace = "auto"

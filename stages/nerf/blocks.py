@@ -24,7 +24,8 @@ LEAST, MOST = 0.5, 6.0
 class View:
     """A posed image: uint8 (h, w, 3) or, with straight alpha, (h, w, 4).
 
-    background: the colour in 0..1 that an opaque image has where nothing of the object is, if that is known.
+    background: the colour in 0..1 that an opaque image has where nothing of the object is, if that is known. learnt:
+    the pixels (h, w) bool that are to be learnt from, None for all.
     """
 
     name: str
@@ -32,6 +33,7 @@ class View:
     camera: Camera
     cam_from_object: np.ndarray
     background: tuple[float, float, float] | None = None
+    learnt: np.ndarray | None = None
 
 
 class Blocks:
@@ -44,13 +46,14 @@ class Blocks:
         self._starts = np.concatenate([[0], np.cumsum(self._grid.prod(axis=1))])
         self.count = int(self._starts[-1])
         self.error, self.depth = np.zeros(self.count, np.float32), np.zeros(self.count, np.float32)
-        self._used = np.ones(self.count, bool)
+        self._learnt = np.concatenate([_any_learnt(v, grid) for v, grid in zip(views, self._grid, strict=True)])
+        self._used = self._learnt.copy()
         self.reweigh()
 
     def use(self, space: Space, allowed: np.ndarray) -> None:
         """Draw from those blocks alone in which an `allowed` cell, (n, n, n) bool, can be seen."""
         cameras = [(self._camera(i), v.cam_from_object) for i, v in enumerate(self._views)]
-        self._used = np.concatenate([seen.ravel() for seen in seen_in(cameras, space, allowed)])
+        self._used = self._learnt & np.concatenate([seen.ravel() for seen in seen_in(cameras, space, allowed)])
         self.reweigh()
 
     def reweigh(self) -> None:
@@ -104,3 +107,13 @@ class Blocks:
             camera, width=int(columns), height=int(rows), fx=camera.fx / SIDE, fy=camera.fy / SIDE,
             cx=scale_pixels(camera.cx, 1 / SIDE), cy=scale_pixels(camera.cy, 1 / SIDE),
         )  # fmt: skip
+
+
+def _any_learnt(view: View, grid: np.ndarray) -> np.ndarray:
+    """Which of a view's blocks, (rows * columns,) bool, have a pixel that is to be learnt from."""
+    rows, columns = (int(side) for side in grid)
+    if view.learnt is None:
+        return np.ones(rows * columns, bool)
+    whole = np.zeros((rows * SIDE, columns * SIDE), bool)
+    whole[: view.learnt.shape[0], : view.learnt.shape[1]] = view.learnt
+    return whole.reshape(rows, SIDE, columns, SIDE).any(axis=(1, 3)).ravel()

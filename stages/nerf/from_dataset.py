@@ -88,7 +88,10 @@ def views_of(dataset: Dataset) -> list[View]:
     """All images of a dataset, loaded."""
     images = dataset.load_images()
     behind = None if dataset.has_alpha else _background(dataset)
-    return [View(r.name, im, r.camera, r.cam_from_object, behind) for r, im in zip(dataset.images, images, strict=True)]
+    return [
+        View(record.name, image, record.camera, record.cam_from_object, behind, dataset.load_learnt(i))
+        for i, (record, image) in enumerate(zip(dataset.images, images, strict=True))
+    ]
 
 
 def _background(dataset: Dataset) -> tuple[float, float, float] | None:
@@ -158,6 +161,9 @@ def train_field(
     if cameras is not None:
         dataset = load_dataset(path, "train", size, holdout=holdout, cameras=cameras)
     views = views_of(dataset)
+    masked = sum(view.learnt is not None for view in views)
+    if masked:
+        say(f"{masked} of {len(views)} training images have masks: what these leave out is not learnt")
     held_out = held_out_views(path, size, holdout, cameras)
     metadata = replace_metadata(metadata_of(dataset, views, config), camera_fit=None if fitted is None else fitted.fit)
     trainer = make_learner(views, metadata.space, config, training)

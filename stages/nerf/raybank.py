@@ -42,6 +42,8 @@ class RayBank:
         centres = np.stack([-v.cam_from_object[:3, :3].T @ v.cam_from_object[:3, 3] for v in views])
         self._origin = ((centres - np.array(space.centre)) / space.scale).astype(np.float32)
         self._background = views[0].background
+        masked = any(v.learnt is not None for v in views)
+        self._learnt = np.concatenate([_learnt(v) for v in views]) if masked else None
 
     def draw(self, rng: np.random.Generator, count: int) -> Batch:
         """A random batch; behind transparent pixels lies a random background, so that opacity is learnt.
@@ -49,6 +51,9 @@ class RayBank:
         So it does behind opaque ones, of which then all has to be in the field, unless their background is known.
         """
         block, view, pixel = self.blocks.draw(rng, count)
+        if self._learnt is not None:
+            instead = nearest_before(self._learnt[self._starts[view] + pixel])
+            block, view, pixel = block[instead], view[instead], pixel[instead]
         in_cam = self._directions[self._map_start[view] + pixel]
         directions = np.einsum("nij,nj->ni", self._rotation[view], in_cam)
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -61,3 +66,15 @@ class RayBank:
             alpha = colour[:, 3:]
             target = target * alpha + (1 - alpha) * background
         return Batch(self._origin[view], directions, np.ascontiguousarray(target), background, block)
+
+
+def nearest_before(good: np.ndarray) -> np.ndarray:
+    """For each of (n,) bool the index of the last good one up to it; of the first good one where there is none."""
+    if not good.any():
+        return np.arange(len(good))
+    found = np.maximum.accumulate(np.where(good, np.arange(len(good)), -1))
+    return np.where(found < 0, good.argmax(), found)
+
+
+def _learnt(view: View) -> np.ndarray:
+    return np.ones(view.image.shape[:2], bool).ravel() if view.learnt is None else view.learnt.ravel()

@@ -255,11 +255,15 @@ def colours(view: View, metadata: FieldMetadata) -> np.ndarray:
 
 
 def evaluate(renderer: NumbaRenderer, views: list[View], every: int = 1) -> list[float]:
-    """PSNR of each view over every so-manieth pixel, its transparent parts over the field's background."""
+    """PSNR of each view over every so-manieth pixel that may be learnt from, its transparent parts over the field's
+    background."""
     result = []
     for view in views:
         origins, directions = rays(view.camera, view.cam_from_object, view.camera.grid()[::every])
         rendered = renderer.render_rays(origins, directions).rgb
         truth = colours(view, renderer.metadata).reshape(-1, 3)[::every]
-        result.append(psnr(float(np.mean((rendered - truth) ** 2))))
+        counted = slice(None) if view.learnt is None else view.learnt.reshape(-1)[::every]
+        errors = (rendered - truth)[counted] ** 2
+        if len(errors):
+            result.append(psnr(float(np.mean(errors))))
     return result

@@ -48,16 +48,21 @@ def _address(recorded: str) -> Address:
 
 
 def _frames(path: str, size: int | None, wanted: Address | None) -> Iterator[CapturedFrame]:
+    """Frames whose number has been there before, as all have that a sender did not count, are numbered on."""
+    numbers: set[int] = set()
+    largest = 0
     for frame, truth in _with_truths(path, wanted):
         camera, header = frame.camera, frame.header
+        number = header.frame_id if header.frame_id not in numbers else largest + 1
+        numbers.add(number)
+        largest = max(largest, number)
         known = None if truth is None else TruePose(truth.cam_from_object)
         image, encoding = frame.image, frame.encoding
         if size is not None and max(camera.width, camera.height) > size:
             image, camera = shrunk_with_camera(_decoded(frame, path), camera, size)
             encoding = "rgb8"
-        name = f"frame {header.frame_id}"
         yield CapturedFrame(
-            header.frame_id, image, encoding, camera, name, header.capture_ns, known, frame.camera_origin
+            number, image, encoding, camera, f"frame {number}", header.capture_ns, known, frame.camera_origin
         )
 
 

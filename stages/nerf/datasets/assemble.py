@@ -11,10 +11,13 @@ from typing import Literal
 import numpy as np
 
 from fieldpose.errors import DatasetError
+from fieldpose.stages.geometry import camera_centres
 from fieldpose.stages.nerf.datasets import images
 from fieldpose.stages.nerf.datasets.bounds import SceneBounds, box_bounds, object_bounds, unbounded_bounds
 from fieldpose.stages.nerf.datasets.records import Dataset, ImageRecord, Kind, PosedCamera, Scene
 
+_COARSEST = 3e-5
+"""Step of positions, as a share of how far cameras are spread: a tenth of what poses are found to."""
 Holdout = Literal["auto", "odd", "every8"]
 Split = Literal["train", "test", "all"]
 
@@ -58,6 +61,7 @@ def assemble(root: Path, draft: Draft, split: Split) -> Dataset:
     if not chosen:
         raise DatasetError(f"{root}: the {split} split is empty; choose another split or holdout, or add images")
     train = [record for record in draft.records if record.split == "train"] or draft.records
+    _check_near(root, train)
     transparent = _is_transparent(draft.records)
     background = images.WHITE if transparent else images.plain_background([partial(_shown, r) for r in train])
     scene: Scene = "object" if background else "unbounded" if draft.aabb is None else "bounded"
@@ -75,6 +79,20 @@ def assemble(root: Path, draft: Draft, split: Split) -> Dataset:
         object_aabb=None if draft.object_aabb is None else np.array(draft.object_aabb, dtype=np.float64),
         notes=draft.notes + (_plain_note(background) if background and not transparent else ()),
     )
+
+
+def _check_near(root: Path, records: Sequence[ImageRecord]) -> None:
+    """DatasetError where numbers of 32 bits, which points have, are too coarse for a scene so far from its origin."""
+    centres = camera_centres(np.stack([record.cam_from_object for record in records]))
+    middle = np.median(centres, axis=0)
+    spread = float(np.median(np.linalg.norm(centres - middle, axis=1)))
+    step = float(np.spacing(np.float32(np.abs(middle).max())))
+    if step > _COARSEST * spread > 0:
+        offset = ", ".join(f"{value:.0f}" for value in middle)
+        raise DatasetError(
+            f"{root}: the cameras are around ({offset}), where positions are good to {step:.2g} only, in a scene of"
+            f" {spread:.2g}; subtract that, as of map coordinates, from all positions"
+        )
 
 
 def _bounds(scene: Scene, draft: Draft, train: list[ImageRecord]) -> SceneBounds:

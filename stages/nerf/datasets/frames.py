@@ -215,7 +215,8 @@ def _record(
         split=split,
         depth_path=depth_path,
         depth_scale=depth_scale,
-        mask_path=_companion(file, frame.mask_file_path or frame.mask_path),
+        mask_path=_companion(file, frame.mask_file_path),
+        learnt_path=_companion(file, frame.mask_path),
     )
 
 

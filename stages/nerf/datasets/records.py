@@ -27,6 +27,7 @@ class ImageRecord:
 
     name is the image's path below the dataset. near and far are depths of its content in object units, where known.
     depth_path (numbers to be multiplied by depth_scale) and mask_path lead to ground truth, where there is any.
+    learnt_path leads to a mask of what is to be learnt from, where that is not all.
     """
 
     name: str
@@ -39,6 +40,7 @@ class ImageRecord:
     depth_path: Path | None = None
     depth_scale: float | None = None
     mask_path: Path | None = None
+    learnt_path: Path | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +110,13 @@ class Dataset:
         if record.mask_path is None:
             raise DatasetError(f"{record.path}: the dataset has no mask for this image")
         return images.load_mask(record.mask_path, record.camera.width, record.camera.height)
+
+    def load_learnt(self, index: int) -> np.ndarray | None:
+        """Pixels (h, w) bool of an image that are to be learnt from; None for all. DatasetError."""
+        record = self.images[index]
+        if record.learnt_path is None:
+            return None
+        return images.load_mask(record.learnt_path, record.camera.width, record.camera.height)
 
     def index(self, name: str) -> int:
         """The place of an image by its name (see find_name)."""

@@ -314,6 +314,13 @@ def test_a_recording_comes_with_its_numbers_times_and_truths(tmp_path: Path) -> 
     assert [f.frame_id for f in frames_of(f"mcap:{tmp_path / 'a.mcap'}", first=2)] == [5, 7]
 
 
+def test_frames_that_were_not_counted_are_numbered_on(tmp_path: Path) -> None:
+    order = [("frame", 4), ("frame", 4), ("frame", 9), ("frame", 4), ("frame", 10)]
+    frames = frames_of(f"mcap:{record(tmp_path / 'a.mcap', order)}")
+    assert [frame.frame_id for frame in frames] == [4, 5, 9, 10, 11]
+    assert len({frame.name for frame in frames}) == 5
+
+
 def test_recorded_images_stay_encoded_unless_they_are_shrunk(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", [("frame", 60)], encoding="jpeg")
     assert frames_of(f"mcap:{path}")[0].encoding == "jpeg"

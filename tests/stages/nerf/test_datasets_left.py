@@ -90,6 +90,21 @@ def test_a_test_file_that_repeats_the_training_file_is_named(tmp_path: Path) -> 
         load_dataset(tmp_path)
 
 
+def test_a_scene_far_from_its_origin_is_refused_with_what_to_subtract(tmp_path: Path) -> None:
+    made.write_transforms(tmp_path, CAMERA)
+    file = tmp_path / "transforms.json"
+    for offset, far in ((100.0, False), (450_000.0, True)):
+        content = json.loads(file.read_text())
+        for frame in content["frames"]:
+            frame["transform_matrix"][0][3] += offset
+        made.write_json(file, content)
+        if far:
+            with pytest.raises(DatasetError, match=r"around \(450\d\d\d, .*good to 0\.031 only.*subtract"):
+                load_dataset(tmp_path)
+        else:
+            assert len(load_dataset(tmp_path, "all")) == 7
+
+
 def test_hidden_files_are_no_images(tmp_path: Path) -> None:
     made.write_llff(tmp_path, made.centred(96, 64, 80.0))
     for folder in ("images", "images_4"):

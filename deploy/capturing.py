@@ -19,7 +19,7 @@ from fieldpose.stages.camera.core import Source
 from fieldpose.stages.camera.sources import open_source
 from fieldpose.stages.camera.sources.folder import natural
 from fieldpose.stages.cores import usable_cores
-from fieldpose.stages.geometry import Camera
+from fieldpose.stages.geometry import Camera, scale_pixels
 from fieldpose.stages.images import decoded, shrunk
 from fieldpose.stages.nerf.datasets.images import EXTENSIONS, is_image_name, upright, upright_size
 from fieldpose.stages.nerf.datasets.transforms import FILE
@@ -28,6 +28,7 @@ from fieldpose.stages.nerf.datasets.writing import transforms_document
 if TYPE_CHECKING:
     from fieldpose.stages.structure.features import Keypoints
     from fieldpose.stages.structure.mapping import Mapped
+    from fieldpose.stages.structure.markers import Marker
     from fieldpose.stages.structure.tracks import Tracks
 
 Report = Callable[[str, float], None]
@@ -76,7 +77,10 @@ class Shots:
 
 @dataclass(frozen=True)
 class Captured:
-    """A dataset that was made, in figures; `reasons` of the images without a place: name -> why."""
+    """A dataset that was made, in figures; `reasons` of the images without a place: name -> why.
+
+    on_plane: whether up is that of a plane. marker: the one that gave frame and unit, and how many images show it.
+    """
 
     images: int
     chosen: int
@@ -87,15 +91,26 @@ class Captured:
     error_px: float
     on_plane: bool
     metres_per_unit: float | None
+    marker: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Square:
+    """Markers that may be in view: their family (stages/structure/markers.py), the length of a side in metres."""
+
+    family: str
+    size_m: float
 
 
 def capture(
-    source: str, out: Path, most: int, size: int, threads: int = 0, report: Report = lambda what, share: None
-) -> Captured:
+    source: str, out: Path, most: int, size: int, threads: int = 0, report: Report = lambda what, share: None,
+    square: Square | None = None,
+) -> Captured:  # fmt: skip
     """Write a dataset of a source (a video, a folder of photographs, or any camera source) into a folder.
 
-    At most `most` frames of a video are taken, and images are shrunk to `size`. Raises SourceError where it cannot be
-    read, and DatasetError where too few cameras are found, which tells why; then nothing is written.
+    At most `most` frames of a video are taken, and images are shrunk to `size`. square: a marker in view that gives the
+    frame, z out of it, and metres. Raises SourceError where the source cannot be read, and DatasetError where too few
+    cameras are found, or no such marker, which tells why; then nothing is written.
     """
     shots = _shots(source, most, size, report)
     if len(shots.chosen) < FEWEST:
@@ -114,7 +129,8 @@ def capture(
             f"{source}: cameras of only {count} of {len(shots.chosen)} images were found ({summary(why)});"
             f" {advice(why)}"
         )
-    return _write(out, shots, mapped, structure, report)
+    marker = None if square is None else structure.marker(mapped, square)
+    return _write(out, shots, mapped, structure, marker, report)
 
 
 def summary(why: dict[str, str]) -> str:
@@ -162,6 +178,32 @@ class Structure:
             lambda share: self._report("finding the cameras", share),
         )  # fmt: skip
         return None if mapped is None else self._closed(mapped)
+
+    def marker(self, mapped: Mapped, square: Square) -> Marker:
+        """The marker that most images with a camera show. DatasetError where there is none."""
+        from fieldpose.stages.structure.markers import FEWEST as FEWEST_SHOWN
+        from fieldpose.stages.structure.markers import Seen, find_markers, place_marker
+        from fieldpose.stages.structure.posed import PosedCameras
+
+        def found(index: int) -> list[Seen]:
+            shot = self._shots.chosen[index]
+            scale = np.array([mapped.camera.width / shot.width, mapped.camera.height / shot.height])
+            return [Seen(m.number, scale_pixels(m.corners, scale)) for m in find_markers(_image(shot), square.family)]
+
+        seen = []
+        with ThreadPoolExecutor(self._threads) as pool:
+            for markers in pool.map(found, mapped.index.tolist()):
+                seen.append(markers)
+                self._report("looking for markers", len(seen) / len(mapped.index))
+        posed = PosedCameras((mapped.camera,) * len(mapped.index), mapped.cam_from_object)
+        marker = place_marker(posed, seen, square.size_m)
+        if marker is None:
+            shown = sum(map(bool, seen))
+            raise DatasetError(
+                f"no marker of family {square.family} was placed: {shown} of {len(seen)} images show one, and one is to"
+                f" be seen in {FEWEST_SHOWN}, flat and whole; is it of that family, with its white border?"
+            )
+        return marker
 
     def why_not(self, mapped: Mapped | None) -> dict[str, str]:
         """Of each image without a place, by its name, why."""
@@ -263,11 +305,15 @@ def _as_placed(tracks: Tracks, index: np.ndarray, count: int) -> Tracks:
     return replace(inner, image=number[inner.image])
 
 
-def _write(out: Path, shots: Shots, mapped: Mapped, structure: Structure, report: Report) -> Captured:
+def _write(
+    out: Path, shots: Shots, mapped: Mapped, structure: Structure, marker: Marker | None, report: Report
+) -> Captured:
     from fieldpose.stages.structure.upright import stand
 
     standing = stand(mapped.cam_from_object, mapped.points)
-    poses = standing.object_from_map.of_poses(mapped.cam_from_object)
+    object_from_map = standing.object_from_map if marker is None else marker.object_from_map
+    poses = object_from_map.of_poses(mapped.cam_from_object)
+    metres = None if marker is None else 1.0
     chosen = [shots.chosen[i] for i in mapped.index]
     names = [f"{IMAGES}/{shot.name}" for shot in chosen]
     cameras = [mapped.camera.resized(shot.width, shot.height) for shot in chosen]
@@ -276,10 +322,10 @@ def _write(out: Path, shots: Shots, mapped: Mapped, structure: Structure, report
         write_bytes(out / IMAGES / shot.name, shot.jpeg)
         report("writing the images", (i + 1) / len(chosen))
     write_json(out / CAMERA_FILE, cameras[0])
-    write_json(out / FILE, transforms_document(names, cameras, poses, held_out))
+    write_json(out / FILE, transforms_document(names, cameras, poses, held_out, metres))
     return Captured(
         len(chosen), len(shots.chosen), len(shots.blurred), shots.seen, structure.why_not(mapped), cameras[0],
-        mapped.error_px, standing.on_plane, None,
+        mapped.error_px, standing.on_plane, metres, None if marker is None else (marker.number, marker.images),
     )  # fmt: skip
 
 

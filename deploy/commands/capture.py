@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from fieldpose.deploy.capturing import ENOUGH, Captured, advice, capture, summary
+from fieldpose.deploy.capturing import ENOUGH, Captured, Square, advice, capture, summary
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
 from fieldpose.errors import OutputError, UsageError
 
@@ -25,11 +26,12 @@ class Options:
     Walk around the object, slowly and in a good light, so that each part of it is seen from several sides, and leave
     it where it stands. Sharp frames are chosen, evenly along the way that the picture moved; cameras are found by what
     the images share, one lens for all of them; up is that of the plane that the object stands on, the origin is on it
-    under what the cameras look at, and the unit, which no image tells, the median distance of the cameras from there.
+    under what the cameras look at, and the unit, which no image tells, the median distance of the cameras from there;
+    with a marker of known size in view (--marker) frame and unit are the marker's.
     The dataset has images/, transforms.json, in which one image in ten is held out, and camera.json, the camera that
     was found, for `run` (--camera.camera-file). Photographs are turned as their EXIF says. The JSON file has: seen,
     chosen, blurred, images (with a camera), reasons (image -> why it has none), camera, error_px, on_plane (whether up
-    is a plane's), metres_per_unit (null: not known), seconds.
+    is a plane's), metres_per_unit (null: not known), marker (its number, how many images show it), seconds.
     """
 
     source: tyro.conf.Positional[str]
@@ -40,6 +42,11 @@ class Options:
     """At most so many frames of a video."""
     size: int = 1600
     """Images whose longer side has more pixels are shrunk to it."""
+    marker: float | None = None
+    """Length of a printed marker's side in metres, its black square: with such a marker in view, beside or under the
+    object, lengths are in metres, z is out of the marker, x to its right, and the origin in its middle."""
+    family: Literal["4x4", "5x5", "6x6", "7x7", "aruco", "tag16h5", "tag25h9", "tag36h11"] = "4x4"
+    """Of the marker: ArUco's dictionaries by their bits, ArUco's original one, or AprilTag's families."""
     threads: int = 0
     """0: one for each core."""
     json: Path | None = None
@@ -49,12 +56,15 @@ class Options:
         """Capture, say what was found."""
         if self.most < 3 or self.size < 64 or self.threads < 0:
             raise UsageError("--most must be at least 3, --size at least 64, and --threads at least 0")
+        if self.marker is not None and not 0 < self.marker < float("inf"):
+            raise UsageError(f"--marker {self.marker}: expected the length of a side in metres")
         if self.out.exists() and (not self.out.is_dir() or any(self.out.iterdir())):
             raise OutputError(f"{self.out}: is there already and not empty; name another folder, or remove it")
         check_writable(self.out / "transforms.json", self.json)
         began = time.monotonic()
         with _progress_bar() as report:
-            captured = capture(self.source, self.out, self.most, self.size, self.threads, report)
+            square = None if self.marker is None else Square(self.family, self.marker)
+            captured = capture(self.source, self.out, self.most, self.size, self.threads, report, square)
         seconds = time.monotonic() - began
         write_json(self.json, {**asdict(captured), "seconds": seconds})
         for line in _in_words(captured, self.out, seconds):
@@ -70,8 +80,12 @@ def _in_words(captured: Captured, out: Path, seconds: float) -> Iterator[str]:
         f"{out}: {captured.images} of {captured.chosen} images have a camera (of {captured.seen} seen{blurred}), error"
         f" {captured.error_px:.2f} px, {lens}; {seconds:.0f} s"
     )
+    if captured.marker is not None:
+        number, images = captured.marker
+        yield f"frame and metres are those of marker {number}, which {images} images show"
     up = "what the object stands on" if captured.on_plane else "the cameras (no plane was found under the object)"
-    yield f"up is that of {up}; lengths are in the median distance of the cameras from what they look at"
+    if captured.marker is None:
+        yield f"up is that of {up}; lengths are in the median distance of the cameras from what they look at"
     if captured.reasons:
         few = captured.images < ENOUGH * captured.chosen
         yield (

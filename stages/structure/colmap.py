@@ -1,4 +1,4 @@
-"""Bundle adjustment by COLMAP, whose conventions stay in here: its first pixel has its centre at 0.5.
+"""COLMAP's bundle adjustment and its models; its conventions stay in here: its first pixel has its centre at 0.5.
 
 Sources: Triggs and others, Bundle adjustment: a modern synthesis (2000); Schönberger and Frahm, Structure-from-motion
 revisited (2016). pycolmap is imported where it is used, since nothing else should wait for it.
@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
 
+from fieldpose.errors import GeometryError
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.geometry.arrays import Points64
 from fieldpose.stages.structure.posed import PosedCameras
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 PIXEL_CENTRE = 0.5
+_PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 _ITERATIONS, _TOLERANCE = 50, 1e-6
 """Of one adjustment, among several: the cost changes by less than a millionth."""
 _ALIGNED_WITHIN_SIGMA = 10.0
@@ -178,3 +181,45 @@ def _scene(
 
 def _matrix(cam_from_world: pycolmap.Rigid3d) -> np.ndarray:
     return np.concatenate([cam_from_world.matrix(), [[0.0, 0.0, 0.0, 1.0]]])
+
+
+@dataclass(frozen=True, eq=False)
+class ModelImage:
+    """An image of a COLMAP model: its name there, its camera, and its cam_from_world (4, 4)."""
+
+    name: str
+    camera: Camera
+    cam_from_world: np.ndarray
+
+
+def read_model(folder: Path) -> list[ModelImage]:
+    """The posed images of a model, binary or text, sorted by name. Raises GeometryError for what is no such model.
+
+    Lenses are those of OpenCV's perspective camera with up to five coefficients; others are refused by name.
+    """
+    import pycolmap
+
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+    try:
+        scene = pycolmap.Reconstruction(folder)
+        posed = [(i.name, i.camera_id, _matrix(i.cam_from_world())) for i in scene.images.values() if i.has_pose]
+    except (RuntimeError, ValueError, IndexError, OSError) as error:
+        raise GeometryError(f"{folder}: no COLMAP model that can be read ({' '.join(str(error).split())})") from error
+    cameras = {camera_id: _perspective(folder, camera) for camera_id, camera in scene.cameras.items()}
+    return [ModelImage(name, cameras[camera], pose) for name, camera, pose in sorted(posed, key=lambda one: one[0])]
+
+
+def _perspective(folder: Path, camera: pycolmap.Camera) -> Camera:
+    name, params = camera.model.name, [float(p) for p in camera.params]
+    lens = [params[i] for i in camera.extra_params_idxs()]
+    if name not in _PERSPECTIVE or any(lens[5:]):
+        raise GeometryError(
+            f"{folder}: camera {camera.camera_id} is of COLMAP's model {name}, of which this has no equal; run COLMAP's"
+            " image_undistorter first, or map the images with the model OPENCV"
+        )
+    k1, k2, p1, p2, k3 = (lens + [0.0] * 5)[:5]
+    return Camera(
+        camera.width, camera.height, float(camera.focal_length_x), float(camera.focal_length_y),
+        float(camera.principal_point_x) - PIXEL_CENTRE, float(camera.principal_point_y) - PIXEL_CENTRE,
+        (k1, k2, p1, p2, k3),
+    )  # fmt: skip

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 from support.commands import fieldpose
 from support.papered_room import cameras_before_a_wall, photograph
+from support.wall_marker import MIDDLE, RIGHT, SIZE, UP, with_marker
 
 from fieldpose.deploy.capturing import CAMERA_FILE, NO_OVERLAP, TOO_LITTLE, advice, capture, summary
 from fieldpose.errors import DatasetError, SourceError
@@ -148,3 +149,26 @@ def test_images_without_a_place_are_named_with_the_reason(tmp_path: Path) -> Non
     assert captured.reasons["z.jpg"] == NO_OVERLAP
     assert summary(captured.reasons) == f"1 {TOO_LITTLE}, 1 {NO_OVERLAP}"
     assert advice({"a": TOO_LITTLE, "b": NO_OVERLAP, "c": NO_OVERLAP}).startswith("film the way")
+
+
+def test_a_marker_gives_frame_and_metres(tmp_path: Path) -> None:
+    for i, pose in enumerate(walk(24)):
+        image = with_marker(photograph(LENS, pose), LENS, pose)
+        Image.fromarray(image).save(tmp_path / f"p{i:02d}.png")
+    ran = fieldpose(
+        "capture", tmp_path, "--out", tmp_path / "out", "--marker", SIZE, "--threads", 2, cwd=tmp_path, timeout_s=120
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "frame and metres are those of marker 7, which" in ran.stdout
+    dataset = load_dataset(tmp_path / "out", "all")
+    assert dataset.metres_per_unit == 1.0
+    truth = np.stack([walk(24)[int(Path(r.name).stem[1:])] for r in dataset.images])
+    apart = camera_centres(np.stack([r.cam_from_object for r in dataset.images]))
+    there = camera_centres(truth) - MIDDLE
+    np.testing.assert_allclose(apart, np.stack([there @ RIGHT, there @ UP, -there[:, 0]], axis=1), atol=0.06)
+    ran = fieldpose(
+        "capture", tmp_path, "--out", tmp_path / "b", "--marker", "0.1", "--family", "tag36h11", cwd=tmp_path
+    )
+    assert ran.returncode == 2
+    assert "no marker of family tag36h11 was placed: 0 of" in ran.stderr
+    assert not (tmp_path / "b" / "images").exists()

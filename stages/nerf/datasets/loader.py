@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fieldpose.errors import DatasetError
-from fieldpose.stages.nerf.datasets import blender, llff, transforms
+from fieldpose.stages.nerf.datasets import blender, colmap, llff, transforms
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, Split, assemble, with_cameras
 from fieldpose.stages.nerf.datasets.records import Dataset, PosedCamera
 
@@ -26,8 +26,8 @@ def load_dataset(
     split: "all" keeps both, each image says which it is in. size: the longer side in pixels to shrink images to.
     downscale: shrink by this factor instead; LLFF takes the folder of that factor. holdout, for kinds without
     splits of their own: "odd" or "every8" images (sorted by name) are test, None holds nothing out, "auto" is "odd"
-    for transforms.json and "every8" for LLFF. llff_normalise: see llff.read_llff. cameras: of all images, both splits,
-    in their order, instead of those that the files tell.
+    for transforms.json and "every8" for LLFF and COLMAP. llff_normalise: see llff.read_llff. cameras: of all images,
+    both splits, in their order, instead of those that the files tell.
     Raises DatasetError, one line that names the file and says how to mend it.
     """
     root = Path(path)
@@ -52,7 +52,10 @@ def _read(root: Path, holdout: Holdout | None, normalise: bool, downscale: int |
         return transforms.read_transforms(root, holdout)
     if (root / llff.FILE).is_file():
         return llff.read_llff(root, holdout, normalise, downscale, size)
-    names = f"{blender.TRAIN_FILE}, {transforms.FILE} or {llff.FILE}"
+    model = colmap.model_of(root)
+    if model is not None:
+        return colmap.read_colmap(root, model, holdout)
+    names = f"{blender.TRAIN_FILE}, {transforms.FILE}, {llff.FILE} or a COLMAP model ({colmap.MODELS[0]})"
     raise DatasetError(f"{root}: not a dataset; expected {names} in it")
 
 

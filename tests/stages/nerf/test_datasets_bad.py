@@ -223,7 +223,9 @@ def test_all_images_deleted(tmp_path: Path) -> None:
 
 
 def test_folders_that_are_no_dataset(tmp_path: Path) -> None:
-    assert_refused(tmp_path, "not a dataset; expected transforms_train.json, transforms.json or poses_bounds.npy")
+    assert_refused(
+        tmp_path, "not a dataset; expected transforms_train.json, transforms.json, poses_bounds.npy or a COLMAP model"
+    )
     assert_refused(tmp_path / "nowhere", "no such folder")
     text(tmp_path / "file.json", "{}")
     assert_refused(tmp_path / "file.json", "a file; give the folder")

@@ -1,0 +1,65 @@
+"""A COLMAP model (binary or text) beside its images, as COLMAP itself and most tools built on it leave them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fieldpose.errors import DatasetError, GeometryError
+from fieldpose.stages.geometry import Camera
+from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
+from fieldpose.stages.nerf.datasets.frames import find_image, relative_name
+from fieldpose.stages.nerf.datasets.images import probe
+from fieldpose.stages.nerf.datasets.records import ImageRecord
+
+MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", ".")
+"""Where a model may be, below a dataset's folder."""
+IMAGES = ("images", ".")
+_FILES = ({"cameras.bin", "images.bin"}, {"cameras.txt", "images.txt"})
+_ASPECT_TOLERANCE = 0.01
+
+
+def model_of(root: Path) -> Path | None:
+    """The folder of a dataset's model; None if it has none."""
+    for name in MODELS:
+        folder = root / name
+        if folder.is_dir() and any(files <= {path.name for path in folder.iterdir()} for files in _FILES):
+            return folder
+    return None
+
+
+def read_colmap(root: Path, model: Path, holdout: Holdout | None) -> Draft:
+    """All images that have a pose; "auto" holds out every eighth. Raises DatasetError."""
+    from fieldpose.stages.structure.colmap import read_model
+
+    try:
+        images = read_model(model)
+    except GeometryError as error:
+        raise DatasetError(str(error)) from error
+    if not images:
+        raise DatasetError(f"{model}: the model has no image with a pose; map the images again")
+    records = []
+    for i, image in enumerate(images):
+        path = next((found for place in IMAGES if (found := find_image(root / place, image.name)) is not None), None)
+        if path is None:
+            raise DatasetError(f"{root}: no image {image.name}, but {model} lists it; restore it in {root / IMAGES[0]}")
+        split = split_of(i, "every8" if holdout == "auto" else holdout)
+        records.append(
+            ImageRecord(relative_name(root, path), path, _fitted(path, image.camera), image.cam_from_world, split)
+        )
+    return Draft("colmap", records)
+
+
+def _fitted(path: Path, camera: Camera) -> Camera:
+    """The camera at the size of the file, which may have been shrunk since it was mapped."""
+    header = probe(path)
+    if (header.width, header.height) == (camera.width, camera.height):
+        return camera
+    if (
+        abs(camera.width * header.height - camera.height * header.width)
+        > _ASPECT_TOLERANCE * camera.width * header.height
+    ):
+        raise DatasetError(
+            f"{path}: the image has {header.width}x{header.height} pixels, its camera {camera.width}x{camera.height},"
+            " another shape; restore the images that were mapped"
+        )
+    return camera.resized(header.width, header.height)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -38,6 +39,8 @@ HELD_OUT_EVERY = 10
 """One in so many images is not learnt from, and tells how good the field is."""
 FEWEST = 8
 """Images that a field can be learnt from at all, and still few."""
+FILMED_S = 60.0
+"""A live camera films for so long, if it is not told otherwise."""
 ENOUGH = 0.8
 """Of the images are to find a place; else the reasons are told."""
 _QUALITY = 95
@@ -104,15 +107,16 @@ class Square:
 
 def capture(
     source: str, out: Path, most: int, size: int, threads: int = 0, report: Report = lambda what, share: None,
-    square: Square | None = None,
+    square: Square | None = None, seconds: float = FILMED_S,
 ) -> Captured:  # fmt: skip
     """Write a dataset of a source (a video, a folder of photographs, or any camera source) into a folder.
 
-    At most `most` frames of a video are taken, and images are shrunk to `size`. square: a marker in view that gives the
-    frame, z out of it, and metres. Raises SourceError where the source cannot be read, and DatasetError where too few
-    cameras are found, or no such marker, which tells why; then nothing is written.
+    At most `most` frames of a video are taken, and images are shrunk to `size`. A live camera films for so many
+    seconds, or until Ctrl-C. square: a marker in view that gives the frame, z out of it, and metres. Raises SourceError
+    where the source cannot be read, and DatasetError where too few cameras are found, or no such marker, which tells
+    why; then nothing is written.
     """
-    shots = _shots(source, most, size, report)
+    shots = _shots(source, most, size, seconds, report)
     if len(shots.chosen) < FEWEST:
         blurred = f"; {len(shots.blurred)} were left out as blurred, so move slowly" if shots.blurred else ""
         raise DatasetError(
@@ -329,14 +333,14 @@ def _write(
     )  # fmt: skip
 
 
-def _shots(source: str, most: int, size: int, report: Report) -> Shots:
+def _shots(source: str, most: int, size: int, seconds: float, report: Report) -> Shots:
     path = Path(source)
     if path.is_dir():
         return _photographs(path, size, report)
     name = source if ":" in source and not path.exists() else f"video:{source}"
     if name.startswith("folder:"):
         return _photographs(Path(name.partition(":")[2]), size, report)
-    return _frames(open_source(CameraConfig(source=name)), most, size, report)
+    return _frames(open_source(CameraConfig(source=name)), most, size, seconds, report)
 
 
 def _photographs(folder: Path, size: int, report: Report) -> Shots:
@@ -377,15 +381,23 @@ def _check_shapes(folder: Path, shots: Sequence[Shot]) -> None:
         )
 
 
-def _frames(source: Source, most: int, size: int, report: Report) -> Shots:
+def _frames(source: Source, most: int, size: int, seconds: float, report: Report) -> Shots:
     from fieldpose.stages.structure.selection import Chooser, Meter
 
     meter, chooser = Meter(), Chooser[Shot](most)
-    for image in _images(source):
-        measured = meter(image)
-        if chooser.wants(measured):
-            chooser.keep(measured, _shot(f"{chooser.seen - 1:05d}.jpg", image, size))
-        report("choosing frames", min(chooser.seen / source.length, 1.0) if source.length else 0.0)
+    live, began = source.clock == "wall", time.monotonic()
+    try:
+        for image in _images(source):
+            measured, filmed_s = meter(image), time.monotonic() - began
+            if chooser.wants(measured):
+                chooser.keep(measured, _shot(f"{chooser.seen - 1:05d}.jpg", image, size))
+            if live and filmed_s >= seconds:
+                break
+            share = filmed_s / seconds if live else chooser.seen / source.length if source.length else 0.0
+            report("filming" if live else "choosing frames", min(share, 1.0))
+    except KeyboardInterrupt:
+        if not live:
+            raise
     chosen, blurred = chooser.chosen()
     return Shots(tuple(c.payload for c in chosen), chooser.seen, tuple(c.payload.name for c in blurred), None, True)
 

@@ -12,7 +12,7 @@ from typing import Literal
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from fieldpose.deploy.capturing import ENOUGH, Captured, Square, advice, capture, summary
+from fieldpose.deploy.capturing import ENOUGH, FILMED_S, Captured, Square, advice, capture, summary
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
 from fieldpose.errors import OutputError, UsageError
 
@@ -35,13 +35,15 @@ class Options:
     """
 
     source: tyro.conf.Positional[str]
-    """A video file, a folder of photographs, or a source as `run` takes it (video:FILE, mcap:FILE)."""
+    """A video file, a folder of photographs, or a source as `run` takes it (video:FILE, mcap:FILE, camera:0)."""
     out: Path
     """The folder to write; it is to be empty or not there."""
     most: int = 150
     """At most so many frames of a video."""
     size: int = 1600
     """Images whose longer side has more pixels are shrunk to it."""
+    seconds: float = FILMED_S
+    """How long a live camera films; Ctrl-C ends it as well, and what was filmed is used."""
     marker: float | None = None
     """Length of a printed marker's side in metres, its black square: with such a marker in view, beside or under the
     object, lengths are in metres, z is out of the marker, x to its right, and the origin in its middle."""
@@ -56,6 +58,8 @@ class Options:
         """Capture, say what was found."""
         if self.most < 3 or self.size < 64 or self.threads < 0:
             raise UsageError("--most must be at least 3, --size at least 64, and --threads at least 0")
+        if not 0 < self.seconds < float("inf"):
+            raise UsageError(f"--seconds {self.seconds}: expected more than 0")
         if self.marker is not None and not 0 < self.marker < float("inf"):
             raise UsageError(f"--marker {self.marker}: expected the length of a side in metres")
         if self.out.exists() and (not self.out.is_dir() or any(self.out.iterdir())):
@@ -64,7 +68,7 @@ class Options:
         began = time.monotonic()
         with _progress_bar() as report:
             square = None if self.marker is None else Square(self.family, self.marker)
-            captured = capture(self.source, self.out, self.most, self.size, self.threads, report, square)
+            captured = capture(self.source, self.out, self.most, self.size, self.threads, report, square, self.seconds)
         seconds = time.monotonic() - began
         write_json(self.json, {**asdict(captured), "seconds": seconds})
         for line in _in_words(captured, self.out, seconds):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 
 import cv2
@@ -13,9 +15,11 @@ from support.commands import fieldpose
 from support.papered_room import cameras_before_a_wall, photograph
 from support.wall_marker import MIDDLE, RIGHT, SIZE, UP, with_marker
 
+from fieldpose.deploy import capturing
 from fieldpose.deploy.capturing import CAMERA_FILE, NO_OVERLAP, TOO_LITTLE, advice, capture, summary
 from fieldpose.errors import DatasetError, SourceError
 from fieldpose.stages.camera.camera_files import read_camera_file
+from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.geometry import Camera, camera_centres, look_at, rotation_error_deg
 from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.structure.similarity import align
@@ -172,3 +176,24 @@ def test_a_marker_gives_frame_and_metres(tmp_path: Path) -> None:
     assert ran.returncode == 2
     assert "no marker of family tag36h11 was placed: 0 of" in ran.stderr
     assert not (tmp_path / "b" / "images").exists()
+
+
+@pytest.mark.parametrize("ends_by", ["time", "Ctrl-C"])
+def test_a_live_camera_films_until_the_time_is_over_or_ctrl_c(
+    pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_by: str
+) -> None:
+    now = 0.0
+
+    def film(first: int) -> Iterator[CapturedFrame]:
+        nonlocal now
+        for i in count():
+            if ends_by == "Ctrl-C" and i == len(pictures):
+                raise KeyboardInterrupt
+            now += 0.1
+            yield CapturedFrame(i, pictures[min(i, len(pictures) - 1)], "rgb8", LENS, f"{i}")
+
+    monkeypatch.setattr(capturing, "open_source", lambda config: Source("camera:0", "wall", film))
+    monkeypatch.setattr(capturing.time, "monotonic", lambda: now)
+    captured = capture("camera:0", tmp_path / "out", 150, 400, 2, seconds=6.0)
+    assert captured.images >= 25
+    assert captured.seen == (len(pictures) if ends_by == "Ctrl-C" else pytest.approx(60, abs=1))

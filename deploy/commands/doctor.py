@@ -29,7 +29,7 @@ class Options:
     field: Path | None = None
     """A field to check."""
     dataset: Path | None = None
-    """A dataset to check, every image of it."""
+    """A dataset to check: every image of it, and whether its cameras fit what the images show, which takes a minute."""
     json: Path | None = None
     """Write the findings into this file."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -13,16 +14,17 @@ import cv2
 import numpy as np
 
 from fieldpose.deploy.reporting.output import write_bytes, write_json
-from fieldpose.errors import DatasetError, SourceError
-from fieldpose.stages.camera.calibration import focal_length_from_exif
+from fieldpose.errors import DatasetError, GeometryError, SourceError
+from fieldpose.stages.camera.calibration import ONE_LENS, focal_length_from_exif
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import Source
-from fieldpose.stages.camera.sources import open_source
+from fieldpose.stages.camera.sources import is_video, open_source
 from fieldpose.stages.camera.sources.folder import natural
 from fieldpose.stages.cores import usable_cores
 from fieldpose.stages.geometry import Camera, scale_pixels
 from fieldpose.stages.images import decoded, shrunk
 from fieldpose.stages.nerf.datasets.images import EXTENSIONS, is_image_name, upright, upright_size
+from fieldpose.stages.nerf.datasets.intrinsics import check_invertible
 from fieldpose.stages.nerf.datasets.transforms import FILE
 from fieldpose.stages.nerf.datasets.writing import transforms_document
 
@@ -52,6 +54,9 @@ _LOOKALIKES = 25
 _UNSURE_FOCAL = 1.2
 """Focal length over the longer side that is taken where nothing tells it: 45 degrees, about that of phones."""
 _FEW_KEYPOINTS = 150
+_WHOLE = 0.9
+"""Of the frames that a video says it has: of fewer, a user is told."""
+_RAW = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw"}
 
 
 @dataclass(frozen=True)
@@ -69,6 +74,7 @@ class Shots:
     """What was chosen of a source, how many images it has, those left out as blurred, and what is known of the lens.
 
     focal_px: of the images' own size, None where nothing tells it. follow: whether they follow one another in time.
+    notes: what a user should know, a line each.
     """
 
     chosen: tuple[Shot, ...]
@@ -76,6 +82,7 @@ class Shots:
     blurred: tuple[str, ...]
     focal_px: float | None
     follow: bool
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -95,6 +102,7 @@ class Captured:
     on_plane: bool
     metres_per_unit: float | None
     marker: tuple[int, int] | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -134,6 +142,13 @@ def capture(
             f" {advice(why)}"
         )
     marker = None if square is None else structure.marker(mapped, square)
+    try:
+        check_invertible(mapped.camera)
+    except GeometryError as error:
+        raise DatasetError(
+            f"{source}: the lens that was found folds the images' corners over ({error}); film with a lens that is less"
+            " wide, or in the camera's linear mode"
+        ) from error
     return _write(out, shots, mapped, structure, marker, report)
 
 
@@ -181,7 +196,12 @@ class Structure:
             self._keypoints, self._pairs, self._matches, self._small, self._shots.focal_px is not None, self._threads,
             lambda share: self._report("finding the cameras", share),
         )  # fmt: skip
-        return None if mapped is None else self._closed(mapped)
+        if mapped is None or len(mapped.index) < FEWEST:
+            return mapped
+        try:
+            return self._closed(mapped)
+        except GeometryError:
+            return mapped
 
     def marker(self, mapped: Mapped, square: Square) -> Marker:
         """The marker that most images with a camera show. DatasetError where there is none."""
@@ -329,7 +349,8 @@ def _write(
     write_json(out / FILE, transforms_document(names, cameras, poses, held_out, metres))
     return Captured(
         len(chosen), len(shots.chosen), len(shots.blurred), shots.seen, structure.why_not(mapped), cameras[0],
-        mapped.error_px, standing.on_plane, metres, None if marker is None else (marker.number, marker.images),
+        mapped.error_px * cameras[0].width / mapped.camera.width, standing.on_plane, metres,
+        None if marker is None else (marker.number, marker.images), shots.notes,
     )  # fmt: skip
 
 
@@ -340,6 +361,8 @@ def _shots(source: str, most: int, size: int, seconds: float, report: Report) ->
     name = source if ":" in source and not path.exists() else f"video:{source}"
     if name.startswith("folder:"):
         return _photographs(Path(name.partition(":")[2]), size, report)
+    if not is_video(name):
+        raise SourceError(f"{source}: expected a video, a camera, a recording or a folder of photographs")
     return _frames(open_source(CameraConfig(source=name)), most, size, seconds, report)
 
 
@@ -349,17 +372,22 @@ def _photographs(folder: Path, size: int, report: Report) -> Shots:
     Those that stand where most lie, or the other way round, are turned by a quarter: one lens then has one camera.
     """
     paths = sorted((p for p in folder.iterdir() if is_image_name(p)), key=natural) if folder.is_dir() else []
+    others = [p.name for p in sorted(folder.iterdir()) if p.suffix.lower() in _RAW] if folder.is_dir() else []
+    left = () if not others else (f"{len(others)} files were not read, as {others[0]}; convert them to JPEG",)
     if not paths:
-        raise SourceError(f"{folder}: no images in this folder; expected {', '.join(EXTENSIONS)}")
+        raise SourceError(f"{folder}: no images in this folder; expected {', '.join(EXTENSIONS)}; {' '.join(left)}")
     shots: list[Shot] = []
     focals: list[float] = []
     known: set[bytes] = set()
+    sizes: set[tuple[int, int]] = set()
+    stems = Counter(path.stem for path in paths)
     portrait = 2 * sum(height > width for width, height in map(upright_size, paths)) > len(paths)
     for i, path in enumerate(paths):
         image = upright(path)
         if (image.shape[0] > image.shape[1]) != portrait and image.shape[0] != image.shape[1]:
             image = np.ascontiguousarray(np.rot90(image))
-        shot = _shot(f"{path.stem}.jpg", image, size)
+        sizes.add((image.shape[1], image.shape[0]))
+        shot = _shot(f"{path.stem}.jpg" if stems[path.stem] == 1 else f"{path.name}.jpg", image, size)
         if shot.jpeg in known:
             continue
         known.add(shot.jpeg)
@@ -367,17 +395,21 @@ def _photographs(folder: Path, size: int, report: Report) -> Shots:
         focal = focal_length_from_exif(path, shot.width, shot.height)
         focals += [] if focal is None else [focal]
         report("reading the photographs", (i + 1) / len(paths))
-    _check_shapes(folder, shots)
-    focal = float(np.median(focals)) if len(focals) == len(shots) else None
-    return Shots(tuple(shots), len(paths), (), focal, False)
-
-
-def _check_shapes(folder: Path, shots: Sequence[Shot]) -> None:
-    shapes = {(s.width, s.height) for s in shots}
-    if len(shapes) > 1:
-        named = ", ".join(f"{w}x{h}" for w, h in sorted(shapes))
+    _check_shapes(folder, sizes)
+    if focals and max(focals) > ONE_LENS * min(focals):
         raise SourceError(
-            f"{folder}: images of several sizes ({named}), so of several cameras; keep those of one camera"
+            f"{folder}: photographs of several lenses (EXIF tells of focal lengths of {min(focals):.0f} to"
+            f" {max(focals):.0f} px); keep those of one lens, without zoom"
+        )
+    focal = float(np.median(focals)) if len(focals) == len(shots) else None
+    return Shots(tuple(shots), len(paths), (), focal, False, left)
+
+
+def _check_shapes(source: Path | str, sizes: set[tuple[int, int]]) -> None:
+    if len(sizes) > 1:
+        named = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
+        raise SourceError(
+            f"{source}: images of several sizes ({named}), so of several cameras; keep those of one camera"
         )
 
 
@@ -386,9 +418,11 @@ def _frames(source: Source, most: int, size: int, seconds: float, report: Report
 
     meter, chooser = Meter(), Chooser[Shot](most)
     live, began = source.clock == "wall", time.monotonic()
+    sizes: set[tuple[int, int]] = set()
     try:
         for image in _images(source):
             measured, filmed_s = meter(image), time.monotonic() - began
+            sizes.add((image.shape[1], image.shape[0]))
             if chooser.wants(measured):
                 chooser.keep(measured, _shot(f"{chooser.seen - 1:05d}.jpg", image, size))
             if live and filmed_s >= seconds:
@@ -398,8 +432,13 @@ def _frames(source: Source, most: int, size: int, seconds: float, report: Report
     except KeyboardInterrupt:
         if not live:
             raise
+    _check_shapes(source.description, sizes)
+    cut = not live and source.length is not None and chooser.seen < _WHOLE * source.length
+    notes = (f"only {chooser.seen} of {source.length} frames could be read: is the file whole?",) if cut else ()
     chosen, blurred = chooser.chosen()
-    return Shots(tuple(c.payload for c in chosen), chooser.seen, tuple(c.payload.name for c in blurred), None, True)
+    return Shots(
+        tuple(c.payload for c in chosen), chooser.seen, tuple(c.payload.name for c in blurred), None, True, notes
+    )
 
 
 def _images(source: Source) -> Iterator[np.ndarray]:

@@ -12,7 +12,7 @@ from typing import Literal
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from fieldpose.deploy.capturing import ENOUGH, FILMED_S, Captured, Square, advice, capture, summary
+from fieldpose.deploy.capturing import ENOUGH, FEWEST, FILMED_S, Captured, Square, advice, capture, summary
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
 from fieldpose.errors import OutputError, UsageError
 
@@ -31,7 +31,7 @@ class Options:
     The dataset has images/, transforms.json, in which one image in ten is held out, and camera.json, the camera that
     was found, for `run` (--camera.camera-file). Photographs are turned as their EXIF says. The JSON file has: seen,
     chosen, blurred, images (with a camera), reasons (image -> why it has none), camera, error_px, on_plane (whether up
-    is a plane's), metres_per_unit (null: not known), marker (its number, how many images show it), seconds.
+    is a plane's), metres_per_unit (null: not known), marker (its number, how many images show it), notes, seconds.
     """
 
     source: tyro.conf.Positional[str]
@@ -56,15 +56,15 @@ class Options:
 
     def run(self) -> int:
         """Capture, say what was found."""
-        if self.most < 3 or self.size < 64 or self.threads < 0:
-            raise UsageError("--most must be at least 3, --size at least 64, and --threads at least 0")
+        if self.most < 2 * FEWEST or self.size < 64 or self.threads < 0:
+            raise UsageError(f"--most must be at least {2 * FEWEST}, --size at least 64, and --threads at least 0")
         if not 0 < self.seconds < float("inf"):
             raise UsageError(f"--seconds {self.seconds}: expected more than 0")
         if self.marker is not None and not 0 < self.marker < float("inf"):
             raise UsageError(f"--marker {self.marker}: expected the length of a side in metres")
         if self.out.exists() and (not self.out.is_dir() or any(self.out.iterdir())):
             raise OutputError(f"{self.out}: is there already and not empty; name another folder, or remove it")
-        check_writable(self.out / "transforms.json", self.json)
+        check_writable(self.out.with_name(f"{self.out.name}.partial"), self.json)
         began = time.monotonic()
         with _progress_bar() as report:
             square = None if self.marker is None else Square(self.family, self.marker)
@@ -96,6 +96,7 @@ def _in_words(captured: Captured, out: Path, seconds: float) -> Iterator[str]:
             f"{len(captured.reasons)} images have no camera: {summary(captured.reasons)}"
             f"{'; ' + advice(captured.reasons) if few else ''}"
         )
+    yield from captured.notes
     yield f"next: fieldpose train {out} --out {out}.safetensors"
 
 

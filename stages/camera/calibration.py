@@ -21,7 +21,7 @@ _EXIF_IFD = 0x8769
 _FOCAL_LENGTH_35MM = 0xA405
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _ASPECT_TOLERANCE = 0.01
-_OTHER_LENS = 1.2
+ONE_LENS = 1.2
 """Focal lengths that differ by more are not those of one lens: fitted ones differ from EXIF's by a few percent, a
 phone's lenses from each other by half and more."""
 
@@ -118,4 +118,4 @@ def _same_shape(camera: Camera, width: int, height: int) -> bool:
 
 
 def _alike(focal: float, other: float) -> bool:
-    return max(focal, other) <= _OTHER_LENS * min(focal, other)
+    return max(focal, other) <= ONE_LENS * min(focal, other)

@@ -185,8 +185,10 @@ def _kalibr(content: Mapping[str, Any]) -> _Numbers:
 
 def _colmap(text: str) -> _Numbers:
     lines = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
-    if len(lines) != 1 or len(lines[0]) < 5:
+    if len(lines) != 1:
         raise ValueError(f"it has {len(lines)} cameras; leave the one that is meant")
+    if len(lines[0]) < 5:
+        raise ValueError("a camera is its number, model, width, height and parameters")
     _, model, width, height, *rest = lines[0]
     if model not in _COLMAP:
         raise ValueError(f"COLMAP's model {model} is not supported; undistort the images to PINHOLE first")

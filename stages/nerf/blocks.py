@@ -16,6 +16,7 @@ SIDE = 4
 """Pixels along each side of a block: as few as are drawn often enough in a minute of training."""
 REMEMBERED = 0.75
 """How much of a block's error is kept when one of its pixels is drawn."""
+_HIDDEN = np.float32(1e-6)
 LEAST, MOST = 0.5, 6.0
 """A block is drawn as often as LEAST + its error / the mean error, this at most MOST."""
 
@@ -94,7 +95,8 @@ class Blocks:
         for i in views:
             view = self._views[i]
             part, shape = slice(self._starts[i], self._starts[i + 1]), tuple(self._grid[i])
-            depth = (self.depth[part] * np.float32(self._scale)).reshape(shape)
+            # What is not learnt from is not judged by: as if something stood before the lens.
+            depth = np.where(self._learnt[part], self.depth[part] * np.float32(self._scale), _HIDDEN).reshape(shape)
             result.append(
                 Marked((self.error[part] > limit).reshape(shape), self._camera(i), view.cam_from_object, depth)
             )

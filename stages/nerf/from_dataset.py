@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
+from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.backend import resolved
 from fieldpose.stages.nerf.blocks import View
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
@@ -161,6 +162,8 @@ def train_field(
     if cameras is not None:
         dataset = load_dataset(path, "train", size, holdout=holdout, cameras=cameras)
     views = views_of(dataset)
+    if all(view.learnt is not None and not view.learnt.any() for view in views):
+        raise DatasetError(f"{path}: the masks (mask_path) leave nothing to learn from; white is what counts")
     masked = sum(view.learnt is not None for view in views)
     if masked:
         say(f"{masked} of {len(views)} training images have masks: what these leave out is not learnt")
@@ -240,7 +243,8 @@ def held_out_views(
         return []
     both = load_dataset(path, "all", size, holdout=holdout, cameras=cameras)
     test = tuple(record for record in both.images if record.split == "test")
-    return views_of(replace(both, images=test)) if test else []
+    views = views_of(replace(both, images=test)) if test else []
+    return [view for view in views if view.learnt is None or view.learnt.any()]
 
 
 class _Monitor:

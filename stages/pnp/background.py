@@ -2,8 +2,8 @@
 
 Parts of an object that look alike agree on poses that turn it into itself there. If the rest of the object then lies on
 the background, and what the frame shows is not where the object would be, the pose is wrong, however many points were
-found. One of the two alone contradicts nothing: a field of few photographs has shreds in the air, which lie on the
-background, and what hides the object is where the object is not.
+found. A little of one of the two alone contradicts nothing: a field of few photographs has shreds in the air, which lie
+on the background, and what hides the object is where the object is not.
 """
 
 from __future__ import annotations

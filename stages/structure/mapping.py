@@ -31,7 +31,7 @@ class Mapped:
     """Where cameras were found to be, in a frame and a unit of their own.
 
     index: which images, sorted.  camera: theirs, of the size that keypoints were given at.  cam_from_object (k, 4, 4).
-    points (m, 3): what they show.  seen (k,): how many of these each shows.  error_px: mean distance of points from
+    points (m, 3): what they show.  seen (k,): how many of these each shows.  error_px: typical distance of points from
     their keypoints.
     """
 

@@ -65,7 +65,7 @@ def alike_pairs(keypoints: Sequence[Keypoints], partners: int) -> list[tuple[int
     signatures = _signatures([root(found.descriptors) for found in keypoints])
     alike = signatures @ signatures.T
     np.fill_diagonal(alike, -np.inf)
-    best = np.argsort(-alike, axis=1, kind="stable")[:, :partners]
+    best = np.argsort(-alike, axis=1, kind="stable")[:, : min(partners, len(keypoints) - 1)]
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(best) for j in row})
 
 

@@ -17,11 +17,13 @@ from support.wall_marker import MIDDLE, RIGHT, SIZE, UP, with_marker
 
 from fieldpose.deploy import capturing
 from fieldpose.deploy.capturing import CAMERA_FILE, NO_OVERLAP, TOO_LITTLE, advice, capture, summary
+from fieldpose.deploy.cli import main
 from fieldpose.errors import DatasetError, SourceError
 from fieldpose.stages.camera.camera_files import read_camera_file
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.geometry import Camera, camera_centres, look_at, rotation_error_deg
 from fieldpose.stages.nerf.datasets import load_dataset
+from fieldpose.stages.structure.mapping import Mapped
 from fieldpose.stages.structure.similarity import align
 
 LENS = Camera(480, 360, 400.0, 400.0, 239.5, 179.5)
@@ -100,14 +102,16 @@ def test_photographs_are_turned_upright_once_and_copies_are_left_out(
             exif[ORIENTATION] = 6
         image.save(folder / f"p{i:02d}.jpg", quality=97, exif=exif)
     (folder / "copy.jpg").write_bytes((folder / "p03.jpg").read_bytes())
+    Image.fromarray(pictures[-1]).save(folder / "p00.png")
     (folder / "._p00.jpg").write_bytes(b"of a Mac")
     told: list[str] = []
     captured = capture(str(folder), tmp_path / "room", 150, 400, 2, lambda what, share: told.append(what))
-    assert captured.chosen == 14
-    assert captured.images == 14
-    assert captured.seen == 15
+    assert captured.chosen == 15
+    assert captured.images == 15
+    assert captured.seen == 16
     assert (captured.camera.width, captured.camera.height) == (400, 300)
-    truth = {f"p{i:02d}": pose for i, pose in enumerate(walk(40)[::3])} | {"copy": walk(40)[9]}
+    truth = {f"p{i:02d}": pose for i, pose in enumerate(walk(40)[::3])}
+    truth |= {"copy": walk(40)[9], "p00.jpg": walk(40)[0], "p00.png": walk(40)[-1]}
     degrees, length = errors(tmp_path / "room", truth)
     assert degrees < 0.5
     assert length < 0.04
@@ -197,3 +201,37 @@ def test_a_live_camera_films_until_the_time_is_over_or_ctrl_c(
     captured = capture("camera:0", tmp_path / "out", 150, 400, 2, seconds=6.0)
     assert captured.images >= 25
     assert captured.seen == (len(pictures) if ends_by == "Ctrl-C" else pytest.approx(60, abs=1))
+
+
+def test_photographs_of_two_lenses_and_what_is_not_read_are_named(
+    pictures: list[np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "IMG_1.HEIC").write_bytes(b"not read")
+    with pytest.raises(SourceError, match=r"no images .*1 files were not read, as IMG_1\.HEIC; convert them"):
+        capture(str(tmp_path), tmp_path / "out", 150, 400, 1)
+    for i, picture in enumerate(pictures[::3]):
+        exif = Image.Exif()
+        exif.get_ifd(0x8769)[0xA405] = 26 if i else 13
+        Image.fromarray(picture).save(tmp_path / f"{i:02d}.jpg", exif=exif)
+    with pytest.raises(SourceError, match="photographs of several lenses"):
+        capture(str(tmp_path), tmp_path / "out", 150, 400, 1)
+    (tmp_path / "00.jpg").unlink()
+    captured = capture(str(tmp_path), tmp_path / "out", 150, 400, 2)
+    assert captured.notes == ("1 files were not read, as IMG_1.HEIC; convert them to JPEG",)
+    with pytest.raises(SourceError, match="expected a video, a camera, a recording or a folder"):
+        capture(f"dataset:{tmp_path / 'out'}:train", tmp_path / "again", 150, 400, 1)
+    assert main(["capture", str(tmp_path), "--out", str(tmp_path / "b"), "--most", "6"]) == 2
+    assert "--most must be at least 16" in capsys.readouterr().err
+
+
+def test_a_lens_that_folds_the_corners_over_is_refused_before_anything_is_written(
+    pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for i, picture in enumerate(pictures[::4]):
+        Image.fromarray(picture).save(tmp_path / f"{i:02d}.png")
+    wide = Camera(400, 300, 220.0, 220.0, 199.5, 149.5, (-0.5, 0.0, 0.0, 0.0, 0.0))
+    mapped = Mapped(np.arange(10), wide, walk(10), np.zeros((0, 3)), np.zeros(10, int), 0.3)
+    monkeypatch.setattr(capturing.Structure, "map", lambda self: mapped)
+    with pytest.raises(DatasetError, match=r"folds the images' corners over .*linear mode"):
+        capture(str(tmp_path), tmp_path / "out", 150, 400, 1)
+    assert not (tmp_path / "out").exists()

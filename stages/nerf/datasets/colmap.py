@@ -7,8 +7,9 @@ from pathlib import Path
 from fieldpose.errors import DatasetError, GeometryError
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
-from fieldpose.stages.nerf.datasets.frames import find_image, relative_name
+from fieldpose.stages.nerf.datasets.frames import check_distinct, find_image, relative_name
 from fieldpose.stages.nerf.datasets.images import probe
+from fieldpose.stages.nerf.datasets.intrinsics import check_invertible
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", ".")
@@ -39,14 +40,29 @@ def read_colmap(root: Path, model: Path, holdout: Holdout | None) -> Draft:
         raise DatasetError(f"{model}: the model has no image with a pose; map the images again")
     records = []
     for i, image in enumerate(images):
-        path = next((found for place in IMAGES if (found := find_image(root / place, image.name)) is not None), None)
+        whole = [root / place / image.name for place in IMAGES if (root / place / image.name).is_file()]
+        tails = (found for place in IMAGES if (found := find_image(root / place, image.name)) is not None)
+        path = next(iter(whole), None) or next(tails, None)
         if path is None:
             raise DatasetError(f"{root}: no image {image.name}, but {model} lists it; restore it in {root / IMAGES[0]}")
         split = split_of(i, "every8" if holdout == "auto" else holdout)
         records.append(
             ImageRecord(relative_name(root, path), path, _fitted(path, image.camera), image.cam_from_world, split)
         )
-    return Draft("colmap", records)
+    check_distinct(model, records)
+    for camera in {record.camera for record in records}:
+        try:
+            check_invertible(camera)
+        except GeometryError as error:
+            raise DatasetError(f"{model}: {error}") from error
+    return Draft("colmap", records, notes=_notes(root, model))
+
+
+def _notes(root: Path, model: Path) -> tuple[str, ...]:
+    others = [p.name for p in sorted(model.parent.iterdir()) if p.is_dir() and p != model and p.name.isdecimal()]
+    if model == root or not model.name.isdecimal() or not others:
+        return ()
+    return (f"{model} is read; its neighbours are not: {', '.join(others)}",)
 
 
 def _fitted(path: Path, camera: Camera) -> Camera:

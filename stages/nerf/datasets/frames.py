@@ -26,6 +26,8 @@ UNSUPPORTED = frozenset({"k5", "k6", "rolling_shutter", "lidar"})
 """Keys that say what this reader has no model for, unless they say nothing."""
 _UNSUPPORTED_HOW = "undistort the images to a pinhole camera first, or take the key out if it means nothing"
 _MISSPELT = 0.74
+_MATTER = ("transform_matrix", "frames", "aabb", "object_aabb", "metres_per_unit")
+_OF_OTHERS = ("_id", "_label", "_path", "_name", "_index")
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
@@ -82,8 +84,11 @@ def check_keys(file: Path, where: str, content: Mapping[str, object], known: typ
     Other keys, which other programs write for themselves, are theirs.
     """
     names = {field.name for field in msgspec.structs.fields(known)}
+    matter = sorted(names & {*(field.name for field in msgspec.structs.fields(Intrinsics)), *_MATTER})
     for key in sorted(content.keys() - names - NOT_OURS):
-        meant = difflib.get_close_matches(key, sorted(names), 1, _MISSPELT)
+        if key.endswith(_OF_OTHERS) or key.startswith("n_"):
+            continue
+        meant = difflib.get_close_matches(key, matter, 1, _MISSPELT)
         if meant:
             raise DatasetError(f"{file}: {where}{key!r} is no key of this file; is {meant[0]!r} meant?")
     for key in sorted(UNSUPPORTED & content.keys()):

@@ -67,9 +67,9 @@ def load_depth(path: Path, width: int, height: int, scale: float) -> np.ndarray:
 
 
 def load_mask(path: Path, width: int, height: int) -> np.ndarray:
-    """A mask image as (height, width) bool: True where it is brighter than the middle grey."""
+    """A mask image as (height, width) bool: True where it is brighter than half of its brightest, be that 255 or 1."""
     grey = _read(path, lambda image: np.array(image.convert("L")))
-    return _resize_nearest(grey, width, height) > 127
+    return _resize_nearest(grey, width, height) > int(grey.max()) / 2
 
 
 def plain_background(load: Sequence[Callable[[], np.ndarray]]) -> Colour | None:

@@ -53,7 +53,7 @@ def camera_of(document: Intrinsics, frame: Intrinsics, header: ImageHeader, pixe
     k1, k2, p1, p2, k3 = (_stated(document, frame, name) or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
     try:
         camera = Camera(header.width, header.height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
-        _check_invertible(camera)
+        check_invertible(camera)
         _check_field_of_view(camera)
     except GeometryError as error:
         raise DatasetError(f"{where}: {error}") from error
@@ -103,7 +103,8 @@ def _check_field_of_view(camera: Camera) -> None:
             )
 
 
-def _check_invertible(camera: Camera) -> None:
+def check_invertible(camera: Camera) -> None:
+    """GeometryError for a lens that folds its image's corners over it."""
     if camera.is_distorted:
         right, bottom = camera.width - 0.5, camera.height - 0.5
         camera.directions(np.array([(-0.5, -0.5), (right, -0.5), (-0.5, bottom), (right, bottom)]))

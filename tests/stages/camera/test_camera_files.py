@@ -113,6 +113,7 @@ BAD = {
     "two cameras": ("a.yaml", kalibr(cameras=2), "it has 2 cameras; leave the one that is meant"),
     "colmap model": ("a.txt", "1 THIN_PRISM_FISHEYE 640 480 1 2 3 4\n", "THIN_PRISM_FISHEYE is not supported"),
     "colmap short": ("a.txt", "1 OPENCV 640 480 1 2 3 4\n", "OPENCV has 8 parameters, got 4"),
+    "colmap words": ("a.txt", "1 PINHOLE 10 10\n", "a camera is its number, model, width, height and parameters"),
     "colmap two": ("a.txt", "1 PINHOLE 6 4 1 1 2 2\n2 PINHOLE 6 4 1 1 2 2\n", "it has 2 cameras"),
     "bomb": ("a.yaml", "a: &a [x,x]\nb: &b [*a,*a]\n" + "c" * (1 << 20), "more than"),
     "code": ("a.yaml", "a: !!python/object/apply:os.system ['true']\n", "no usable camera file"),

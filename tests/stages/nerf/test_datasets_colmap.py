@@ -104,3 +104,21 @@ def test_what_is_missing_or_damaged_is_told(tmp_path: Path) -> None:
     model.write_bytes(model.read_bytes()[:40])
     with pytest.raises(DatasetError, match="no COLMAP model that can be read"):
         load_dataset(tmp_path)
+
+
+def test_a_file_stands_for_one_image_and_neighbouring_models_are_named(tmp_path: Path) -> None:
+    write(tmp_path, "PINHOLE", LENSES["PINHOLE"][1])
+    (tmp_path / "sparse/1").mkdir()
+    (note,) = load_dataset(tmp_path, "all").notes
+    assert note.endswith("its neighbours are not: 1")
+    model = pycolmap.Reconstruction(tmp_path / "sparse/0")
+    model.images[20].name, model.images[19].name = "cam1/000.png", "cam2/000.png"
+    model.write_binary(tmp_path / "sparse/0")
+    with pytest.raises(DatasetError, match=r"images/000\.png is listed twice"):
+        load_dataset(tmp_path)
+
+
+def test_a_lens_that_folds_the_corners_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, "SIMPLE_RADIAL", [50.0, 46.5, 34.0, -0.5])
+    with pytest.raises(DatasetError, match=r"sparse/0: .*inverse"):
+        load_dataset(tmp_path)

@@ -68,7 +68,8 @@ def test_keys_of_other_programs_are_theirs(tmp_path: Path) -> None:
         "orientation_override": "none", "n_extra_learnable_dims": 0,
     }  # fmt: skip
     made.edit_json(file, **theirs)
-    made.edit_frame(file, 0, colmap_im_id=3, sharpness=12.0)
+    made.edit_frame(file, 0, colmap_im_id=3, sharpness=12.0, normal_file_path="n.png", camera_id=1, camera_label="a")
+    made.edit_json(file, n_frames=7)
     assert len(load_dataset(tmp_path, "all")) == 7
 
 

@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from support import posed_images as made
 
 from fieldpose.deploy.cameras import fit_cameras
-from fieldpose.stages.nerf.blocks import View
-from fieldpose.stages.nerf.config import FieldConfig
+from fieldpose.errors import DatasetError
+from fieldpose.stages.nerf.blocks import Blocks, View
+from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.nerf.field import Field, new_net
-from fieldpose.stages.nerf.from_dataset import metadata_of, views_of
+from fieldpose.stages.nerf.from_dataset import metadata_of, train_field, views_of
 from fieldpose.stages.nerf.metadata import FieldMetadata, Space
 from fieldpose.stages.nerf.raybank import RayBank, nearest_before
 from fieldpose.stages.nerf.renderer import NumbaRenderer
@@ -74,12 +75,14 @@ def test_masked_pixels_are_not_counted() -> None:
     assert evaluate(renderer, blue, 3) == pytest.approx(evaluate(renderer, same, 3), abs=1e-6)
 
 
-def test_mask_path_says_what_is_learnt_from_and_mask_file_path_what_is_true(tmp_path: Path) -> None:
+@pytest.mark.parametrize("brightest", [1, 255])
+def test_mask_path_says_what_is_learnt_from_and_mask_file_path_what_is_true(tmp_path: Path, brightest: int) -> None:
     made.write_transforms(tmp_path, made.centred(48, 32, 60.0))
     left = np.zeros((32, 48), np.uint8)
-    left[:, :20] = 255
+    left[:, :20] = brightest
     made.save(tmp_path / "masks/0.png", left)
-    made.save(tmp_path / "truth/0.png", 255 - left)
+    made.save(tmp_path / "masks/none.png", np.zeros_like(left))
+    made.save(tmp_path / "truth/0.png", brightest - left)
     file = tmp_path / "transforms.json"
     made.edit_frame(file, 0, mask_path="masks/0.png", mask_file_path="truth/0.png")
     dataset = load_dataset(tmp_path, "all")
@@ -94,3 +97,19 @@ def test_mask_path_says_what_is_learnt_from_and_mask_file_path_what_is_true(tmp_
     assert views[1].learnt is None
     assert metadata_of(dataset, views, SMALL).space.contracted
     assert fit_cameras(dataset, "auto", 1).fit.verdict == "too few"
+    for i in range(7):
+        made.edit_frame(file, i, mask_path="masks/none.png")
+    with pytest.raises(DatasetError, match="leave nothing to learn from"):
+        train_field(tmp_path, tmp_path / "field.safetensors", None, "auto", TrainingConfig(steps=1), SMALL)
+
+
+def test_views_that_mask_a_place_say_nothing_of_what_is_missing_there() -> None:
+    views = masked_views()
+    blocks = Blocks(views, SPACE)
+    blocks.learnt(np.arange(blocks.count), np.full(blocks.count, 0.5, np.float32), np.full(blocks.count, 2, np.float32))
+    wrong = blocks.wrong(0.1, np.arange(5))
+    assert wrong[0].depth is not None
+    assert wrong[2].depth is not None
+    assert (wrong[0].depth > 1).all()
+    assert (wrong[2].depth < 1e-3).all()
+    assert (wrong[2].depth > 0).all()

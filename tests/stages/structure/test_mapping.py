@@ -92,3 +92,4 @@ def test_what_looks_alike_is_matched() -> None:
     assert len(pairs) < 0.6 * 18 * 17 / 2
     assert pairs == sorted(set(pairs))
     assert all(0 <= i < j < 18 for i, j in pairs)
+    assert all(i < j for i, j in alike_pairs(keypoints[:4], 6))

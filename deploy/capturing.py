@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,16 +12,11 @@ import cv2
 import numpy as np
 
 from fieldpose.deploy.reporting.output import write_bytes, write_json
-from fieldpose.errors import DatasetError, GeometryError, SourceError
-from fieldpose.stages.camera.calibration import ONE_LENS, focal_length_from_exif
-from fieldpose.stages.camera.config import CameraConfig
-from fieldpose.stages.camera.core import Source
-from fieldpose.stages.camera.sources import is_video, open_source
-from fieldpose.stages.camera.sources.folder import natural
+from fieldpose.deploy.shots import FILMED_S, Report, Shot, Shots, read_shots
+from fieldpose.errors import DatasetError, GeometryError
 from fieldpose.stages.cores import usable_cores
 from fieldpose.stages.geometry import Camera, scale_pixels
-from fieldpose.stages.images import decoded, shrunk
-from fieldpose.stages.nerf.datasets.images import EXTENSIONS, is_image_name, upright, upright_size
+from fieldpose.stages.images import shrunk
 from fieldpose.stages.nerf.datasets.intrinsics import check_invertible
 from fieldpose.stages.nerf.datasets.transforms import FILE
 from fieldpose.stages.nerf.datasets.writing import transforms_document
@@ -32,20 +25,15 @@ if TYPE_CHECKING:
     from fieldpose.stages.structure.features import Keypoints
     from fieldpose.stages.structure.mapping import Mapped
     from fieldpose.stages.structure.markers import Marker
-    from fieldpose.stages.structure.tracks import Tracks
 
-Report = Callable[[str, float], None]
 IMAGES = "images"
 CAMERA_FILE = "camera.json"
 HELD_OUT_EVERY = 10
 """One in so many images is not learnt from, and tells how good the field is."""
 FEWEST = 8
 """Images that a field can be learnt from at all, and still few."""
-FILMED_S = 60.0
-"""A live camera films for so long, if it is not told otherwise."""
 ENOUGH = 0.8
 """Of the images are to find a place; else the reasons are told."""
-_QUALITY = 95
 _NEIGHBOURS = 8
 """Frames of a video that each is matched with: those that came before it."""
 _ALL_PAIRS = 80
@@ -54,35 +42,6 @@ _LOOKALIKES = 25
 _UNSURE_FOCAL = 1.2
 """Focal length over the longer side that is taken where nothing tells it: 45 degrees, about that of phones."""
 _FEW_KEYPOINTS = 150
-_WHOLE = 0.9
-"""Of the frames that a video says it has: of fewer, a user is told."""
-_RAW = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw"}
-
-
-@dataclass(frozen=True)
-class Shot:
-    """One image to find a camera for: its name in the dataset, the bytes of its upright JPEG file, and its size."""
-
-    name: str
-    jpeg: bytes
-    width: int
-    height: int
-
-
-@dataclass(frozen=True)
-class Shots:
-    """What was chosen of a source, how many images it has, those left out as blurred, and what is known of the lens.
-
-    focal_px: of the images' own size, None where nothing tells it. follow: whether they follow one another in time.
-    notes: what a user should know, a line each.
-    """
-
-    chosen: tuple[Shot, ...]
-    seen: int
-    blurred: tuple[str, ...]
-    focal_px: float | None
-    follow: bool
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -124,7 +83,7 @@ def capture(
     where the source cannot be read, and DatasetError where too few cameras are found, or no such marker, which tells
     why; then nothing is written.
     """
-    shots = _shots(source, most, size, seconds, report)
+    shots = read_shots(source, most, size, seconds, report)
     if len(shots.chosen) < FEWEST:
         blurred = f"; {len(shots.blurred)} were left out as blurred, so move slowly" if shots.blurred else ""
         raise DatasetError(
@@ -185,6 +144,7 @@ class Structure:
         self._pairs: list[tuple[int, int]] = []
         self._matches: list[np.ndarray] = []
         self._sharpness: list[float] = []
+        self.notes = shots.notes
 
     def map(self) -> Mapped | None:
         """Cameras in a frame of their own, None where no two images fit."""
@@ -200,7 +160,8 @@ class Structure:
             return mapped
         try:
             return self._closed(mapped)
-        except GeometryError:
+        except GeometryError as error:
+            self.notes += (f"the cameras are as they were mapped, since adjusting them all found none ({error})",)
             return mapped
 
     def marker(self, mapped: Mapped, square: Square) -> Marker:
@@ -212,7 +173,7 @@ class Structure:
         def found(index: int) -> list[Seen]:
             shot = self._shots.chosen[index]
             scale = np.array([mapped.camera.width / shot.width, mapped.camera.height / shot.height])
-            return [Seen(m.number, scale_pixels(m.corners, scale)) for m in find_markers(_image(shot), square.family)]
+            return [Seen(m.number, scale_pixels(m.corners, scale)) for m in find_markers(shot.image(), square.family)]
 
         seen = []
         with ThreadPoolExecutor(self._threads) as pool:
@@ -262,7 +223,7 @@ class Structure:
         small = self._small
 
         def found(shot: Shot) -> tuple[Keypoints, float]:
-            image = shrunk(_image(shot), max(small.width, small.height))
+            image = shrunk(shot.image(), max(small.width, small.height))
             return find_keypoints(image, MOST_KEYPOINTS), sharpness(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
 
         with ThreadPoolExecutor(self._threads) as pool:
@@ -296,7 +257,7 @@ class Structure:
         Nearness in space comes after nearness in time: parts that look alike, like a label that is there twice, would
         fold the way over itself.
         """
-        from fieldpose.stages.structure.adjustment import adjust
+        from fieldpose.stages.structure.adjustment import LEAST_ANGLE, adjust
         from fieldpose.stages.structure.pairs import choose_pairs
         from fieldpose.stages.structure.posed import PosedCameras
         from fieldpose.stages.structure.tracks import join_tracks
@@ -307,26 +268,15 @@ class Structure:
         self._report("adjusting the cameras", 0.0)
         tracks = join_tracks(self._keypoints, self._pairs, self._matches)
         posed = PosedCameras((mapped.camera,) * len(mapped.index), mapped.cam_from_object)
-        tracks = _as_placed(tracks, mapped.index, len(self._keypoints))
+        tracks = tracks.seen_in(np.isin(np.arange(len(self._keypoints)), mapped.index))
         adjusted = adjust(posed, tracks, "distortion")
         found = triangulate(adjusted, tracks)
-        good = np.isfinite(np.bincount(tracks.track, found.error_px, tracks.count)) & (found.angle_rad > _LEAST_ANGLE)
+        good = np.isfinite(np.bincount(tracks.track, found.error_px, tracks.count)) & (found.angle_rad > LEAST_ANGLE)
         self._report("adjusting the cameras", 1.0)
         return replace(
             mapped, camera=adjusted.cameras[0], cam_from_object=adjusted.cam_from_object, points=found.points[good],
             seen=tracks.seen_by(len(mapped.index)), error_px=float(np.median(found.error_px)),
         )  # fmt: skip
-
-
-_LEAST_ANGLE = np.deg2rad(2.0)
-
-
-def _as_placed(tracks: Tracks, index: np.ndarray, count: int) -> Tracks:
-    """The tracks as the placed images alone see them, these numbered anew."""
-    number = np.full(count, -1)
-    number[index] = np.arange(len(index))
-    inner = tracks.without(number[tracks.image] < 0)
-    return replace(inner, image=number[inner.image])
 
 
 def _write(
@@ -350,114 +300,8 @@ def _write(
     return Captured(
         len(chosen), len(shots.chosen), len(shots.blurred), shots.seen, structure.why_not(mapped), cameras[0],
         mapped.error_px * cameras[0].width / mapped.camera.width, standing.on_plane, metres,
-        None if marker is None else (marker.number, marker.images), shots.notes,
+        None if marker is None else (marker.number, marker.images), structure.notes,
     )  # fmt: skip
-
-
-def _shots(source: str, most: int, size: int, seconds: float, report: Report) -> Shots:
-    path = Path(source)
-    if path.is_dir():
-        return _photographs(path, size, report)
-    name = source if ":" in source and not path.exists() else f"video:{source}"
-    if name.startswith("folder:"):
-        return _photographs(Path(name.partition(":")[2]), size, report)
-    if not is_video(name):
-        raise SourceError(f"{source}: expected a video, a camera, a recording or a folder of photographs")
-    return _frames(open_source(CameraConfig(source=name)), most, size, seconds, report)
-
-
-def _photographs(folder: Path, size: int, report: Report) -> Shots:
-    """All images of a folder, upright as their EXIF says, files that are there twice only once.
-
-    Those that stand where most lie, or the other way round, are turned by a quarter: one lens then has one camera.
-    """
-    paths = sorted((p for p in folder.iterdir() if is_image_name(p)), key=natural) if folder.is_dir() else []
-    others = [p.name for p in sorted(folder.iterdir()) if p.suffix.lower() in _RAW] if folder.is_dir() else []
-    left = () if not others else (f"{len(others)} files were not read, as {others[0]}; convert them to JPEG",)
-    if not paths:
-        raise SourceError(f"{folder}: no images in this folder; expected {', '.join(EXTENSIONS)}; {' '.join(left)}")
-    shots: list[Shot] = []
-    focals: list[float] = []
-    known: set[bytes] = set()
-    sizes: set[tuple[int, int]] = set()
-    stems = Counter(path.stem for path in paths)
-    portrait = 2 * sum(height > width for width, height in map(upright_size, paths)) > len(paths)
-    for i, path in enumerate(paths):
-        image = upright(path)
-        if (image.shape[0] > image.shape[1]) != portrait and image.shape[0] != image.shape[1]:
-            image = np.ascontiguousarray(np.rot90(image))
-        sizes.add((image.shape[1], image.shape[0]))
-        shot = _shot(f"{path.stem}.jpg" if stems[path.stem] == 1 else f"{path.name}.jpg", image, size)
-        if shot.jpeg in known:
-            continue
-        known.add(shot.jpeg)
-        shots.append(shot)
-        focal = focal_length_from_exif(path, shot.width, shot.height)
-        focals += [] if focal is None else [focal]
-        report("reading the photographs", (i + 1) / len(paths))
-    _check_shapes(folder, sizes)
-    if focals and max(focals) > ONE_LENS * min(focals):
-        raise SourceError(
-            f"{folder}: photographs of several lenses (EXIF tells of focal lengths of {min(focals):.0f} to"
-            f" {max(focals):.0f} px); keep those of one lens, without zoom"
-        )
-    focal = float(np.median(focals)) if len(focals) == len(shots) else None
-    return Shots(tuple(shots), len(paths), (), focal, False, left)
-
-
-def _check_shapes(source: Path | str, sizes: set[tuple[int, int]]) -> None:
-    if len(sizes) > 1:
-        named = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
-        raise SourceError(
-            f"{source}: images of several sizes ({named}), so of several cameras; keep those of one camera"
-        )
-
-
-def _frames(source: Source, most: int, size: int, seconds: float, report: Report) -> Shots:
-    from fieldpose.stages.structure.selection import Chooser, Meter
-
-    meter, chooser = Meter(), Chooser[Shot](most)
-    live, began = source.clock == "wall", time.monotonic()
-    sizes: set[tuple[int, int]] = set()
-    try:
-        for image in _images(source):
-            measured, filmed_s = meter(image), time.monotonic() - began
-            sizes.add((image.shape[1], image.shape[0]))
-            if chooser.wants(measured):
-                chooser.keep(measured, _shot(f"{chooser.seen - 1:05d}.jpg", image, size))
-            if live and filmed_s >= seconds:
-                break
-            share = filmed_s / seconds if live else chooser.seen / source.length if source.length else 0.0
-            report("filming" if live else "choosing frames", min(share, 1.0))
-    except KeyboardInterrupt:
-        if not live:
-            raise
-    _check_shapes(source.description, sizes)
-    cut = not live and source.length is not None and chooser.seen < _WHOLE * source.length
-    notes = (f"only {chooser.seen} of {source.length} frames could be read: is the file whole?",) if cut else ()
-    chosen, blurred = chooser.chosen()
-    return Shots(
-        tuple(c.payload for c in chosen), chooser.seen, tuple(c.payload.name for c in blurred), None, True, notes
-    )
-
-
-def _images(source: Source) -> Iterator[np.ndarray]:
-    for frame in source.frames(0):
-        image = decoded(frame.encoding, frame.image, frame.camera.width, frame.camera.height)
-        if image is not None:
-            yield image
-
-
-def _shot(name: str, image: np.ndarray, size: int) -> Shot:
-    image = shrunk(image, size)
-    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    return Shot(name, jpeg.tobytes(), image.shape[1], image.shape[0])
-
-
-def _image(shot: Shot) -> np.ndarray:
-    image = decoded("jpeg", np.frombuffer(shot.jpeg, np.uint8), shot.width, shot.height)
-    assert image is not None, "what was encoded here can be decoded"
-    return image
 
 
 def _guessed(width: int, height: int, focal_px: float | None) -> Camera:

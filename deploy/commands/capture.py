@@ -12,8 +12,9 @@ from typing import Literal
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from fieldpose.deploy.capturing import ENOUGH, FEWEST, FILMED_S, Captured, Square, advice, capture, summary
+from fieldpose.deploy.capturing import ENOUGH, FEWEST, Captured, Square, advice, capture, summary
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
+from fieldpose.deploy.shots import FILMED_S
 from fieldpose.errors import OutputError, UsageError
 
 

@@ -74,9 +74,9 @@ class Calibrator:
 
     def turns(self, path: Path) -> bool:
         """Whether photo() turns that photograph. Raises DatasetError and SourceError."""
-        header, turned = probe(path), upright_size(path)
         if orientation(path) == 1:
             return False
+        header, turned = probe(path), upright_size(path)
         return self._fits(*turned) or not self._fits(header.width, header.height)
 
     def _fits(self, width: int, height: int) -> bool:

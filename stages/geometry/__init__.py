@@ -22,6 +22,7 @@ from fieldpose.stages.geometry.rigid import (
     is_rigid,
     log_se3,
     look_at,
+    nearest_point_to_axes,
     nearest_rigid,
     rotation_about,
 )
@@ -43,6 +44,7 @@ __all__ = [
     "log_se3",
     "look_at",
     "mahalanobis_squared",
+    "nearest_point_to_axes",
     "nearest_rigid",
     "pairwise",
     "perturb",

@@ -8,6 +8,7 @@ for an inverse.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -139,6 +140,24 @@ def camera_centre(cam_from_object: Transform) -> Vector:
 def camera_centres(cam_from_object: Transforms) -> Points:
     """camera_centre of each of several poses."""
     return -np.einsum("nji,nj->ni", cam_from_object[:, :3, :3], cam_from_object[:, :3, 3])
+
+
+def nearest_point_to_axes(cam_from_object: Sequence[Transform] | Transforms) -> Vector:
+    """The point (3,) with the least sum of squared distances to the optical axes.
+
+    Where the axes do not meet in front of the cameras: ahead of their middle, as far as the cameras are spread if
+    they all face one way, and in their middle if they look all around.
+    """
+    centres, forwards = camera_centres(np.asarray(cam_from_object)), np.asarray(cam_from_object)[:, 2, :3]
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
+    total = across.sum(axis=0)
+    middle = centres.mean(axis=0)
+    if np.linalg.eigvalsh(total)[0] > 1e-6 * len(centres):
+        point = np.linalg.solve(total, (across @ centres[:, :, None]).sum(axis=0)[:, 0])
+        if np.median(np.einsum("ij,ij->i", point - centres, forwards)) > 0:
+            return point
+    spread = float(np.linalg.norm(centres - middle, axis=1).max())
+    return middle + (spread if spread > 0 else 1.0) * forwards.mean(axis=0)
 
 
 def _unit(vector: ArrayLike, what: str) -> np.ndarray:

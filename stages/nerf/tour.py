@@ -7,8 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fieldpose.stages.geometry import Camera, Limit, camera_centres, look_at, nearest_rigid, pairwise
-from fieldpose.stages.nerf.datasets.bounds import nearest_point_to_axes
+from fieldpose.stages.geometry import (
+    Camera,
+    Limit,
+    camera_centres,
+    look_at,
+    nearest_point_to_axes,
+    nearest_rigid,
+    pairwise,
+)
 from fieldpose.stages.nerf.metadata import FieldMetadata
 
 _LARGEST_GAP = np.pi / 2

@@ -10,11 +10,10 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from fieldpose.stages.geometry import camera_centre
+from fieldpose.stages.geometry import camera_centre, nearest_point_to_axes
 from fieldpose.stages.geometry.cameras import rays
 from fieldpose.stages.nerf.blocks import View
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
-from fieldpose.stages.nerf.datasets.bounds import nearest_point_to_axes
 from fieldpose.stages.nerf.exploration import POSSIBLE, SURE, due, missing, silhouettes
 from fieldpose.stages.nerf.field import Field, domain_of, new_net
 from fieldpose.stages.nerf.hull import hull

@@ -18,7 +18,7 @@ from fieldpose.stages.structure.triangulation import Triangulated, triangulate
 
 FEWEST_SEEN = 30
 """Tracks that an image must show to be adjusted: what COLMAP asks of an image before it is posed."""
-_LEAST_ANGLE = np.deg2rad(1.5)
+LEAST_ANGLE = np.deg2rad(1.5)
 """Between the rays to a point, as COLMAP asks: else nearly nothing is known of its depth."""
 _FEWEST_ROUNDS, _MOST_ROUNDS = 3, 10
 _SETTLED = 0.01
@@ -46,7 +46,7 @@ def adjust(given: PosedCameras, tracks: Tracks, freedom: Freedom, start: PosedCa
     input has the same result. Raises GeometryError where what is found makes no camera.
     """
     images = supported(tracks, len(given))
-    inner = _only(tracks, images)
+    inner = tracks.seen_in(images)
     anchors, now = given.chosen(images), (start or given).chosen(images)
     if inner.count == 0:
         return given
@@ -70,7 +70,7 @@ def _round(
     fitting = tracks.without(found.error_px > max(_WRONG * error, _LEAST_WRONG_PX))
     placed = triangulate(now, fitting)
     behind = np.bincount(fitting.track, ~np.isfinite(placed.error_px), fitting.count) > 0
-    good = (placed.angle_rad > _LEAST_ANGLE) & ~behind
+    good = (placed.angle_rad > LEAST_ANGLE) & ~behind
     noise_px = error / MEDIAN_LENGTH
     priors = _priors(now, anchors) if near and freedom != "focal alone" else None
     adjusted = bundle_adjust(now, placed.points[good], fitting.chosen(good), freedom, noise_px, priors)
@@ -86,10 +86,3 @@ def _priors(now: PosedCameras, anchors: PosedCameras) -> PlacePriors | None:
     moved = np.linalg.norm(centres - camera_centres(now.cam_from_object), axis=1)
     sigma = float(np.median(moved)) / _MEDIAN_LENGTH_3D
     return PlacePriors(centres, sigma) if sigma > 0 else None
-
-
-def _only(tracks: Tracks, images: Flags) -> Tracks:
-    """The tracks as the flagged images alone see them, these numbered anew."""
-    seen = tracks.without(~images[tracks.image])
-    number = np.cumsum(images) - 1
-    return Tracks(seen.track, number[seen.image], seen.pixels)

@@ -37,6 +37,12 @@ class Tracks:
         """How many tracks each of `count` images shows."""
         return np.bincount(self.image, minlength=count)
 
+    def seen_in(self, images: Flags) -> Tracks:
+        """As the flagged images alone see them, these numbered anew, as are the tracks that they show enough of."""
+        seen = self.without(~images[self.image])
+        number = np.cumsum(images) - 1
+        return Tracks(seen.track, number[seen.image], seen.pixels)
+
     def without(self, observations: Flags) -> Tracks:
         """All but the flagged observations, and but the tracks that become too short by that, numbered anew."""
         left = np.bincount(self.track[~observations], minlength=self.count)

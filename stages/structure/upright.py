@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fieldpose.stages.geometry import camera_centres
+from fieldpose.stages.geometry import camera_centres, nearest_point_to_axes
 from fieldpose.stages.geometry.arrays import Points64, Transforms, Vector
 from fieldpose.stages.structure.similarity import Similarity
 
@@ -37,21 +37,13 @@ class Standing:
 
 def stand(cam_from_map: Transforms, points: Points64) -> Standing:
     """A frame for cameras (n, 4, 4) and what they show (m, 3)."""
-    centres, axes = camera_centres(cam_from_map), cam_from_map[:, 2, :3]
-    focus = nearest_to_lines(centres, axes)
+    centres, focus = camera_centres(cam_from_map), nearest_point_to_axes(cam_from_map)
     unit = float(np.median(np.linalg.norm(centres - focus, axis=1)))
     around = mean_up(cam_from_map)
     plane = dominant_plane(points, centres, around, _THICKNESS * unit)
     up, origin = (around, focus) if plane is None else (plane[0], focus - (plane[0] @ focus - plane[1]) * plane[0])
     rotation = _upright(up, centres[0] - focus)
     return Standing(Similarity(1 / unit, rotation, -rotation @ origin / unit), plane is not None)
-
-
-def nearest_to_lines(origins: Points64, directions: Points64) -> Vector:
-    """The point with the least sum of squared distances to lines (n, 3), of unit directions (n, 3)."""
-    across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
-    solved = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, origins), rcond=None)[0]
-    return np.asarray(solved)
 
 
 def mean_up(cam_from_map: Transforms) -> Vector:

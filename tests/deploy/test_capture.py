@@ -15,10 +15,10 @@ from support.commands import fieldpose
 from support.papered_room import cameras_before_a_wall, photograph
 from support.wall_marker import MIDDLE, RIGHT, SIZE, UP, with_marker
 
-from fieldpose.deploy import capturing
+from fieldpose.deploy import capturing, shots
 from fieldpose.deploy.capturing import CAMERA_FILE, NO_OVERLAP, TOO_LITTLE, advice, capture, summary
 from fieldpose.deploy.cli import main
-from fieldpose.errors import DatasetError, SourceError
+from fieldpose.errors import DatasetError, GeometryError, SourceError
 from fieldpose.stages.camera.camera_files import read_camera_file
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.geometry import Camera, camera_centres, look_at, rotation_error_deg
@@ -196,8 +196,8 @@ def test_a_live_camera_films_until_the_time_is_over_or_ctrl_c(
             now += 0.1
             yield CapturedFrame(i, pictures[min(i, len(pictures) - 1)], "rgb8", LENS, f"{i}")
 
-    monkeypatch.setattr(capturing, "open_source", lambda config: Source("camera:0", "wall", film))
-    monkeypatch.setattr(capturing.time, "monotonic", lambda: now)
+    monkeypatch.setattr(shots, "open_source", lambda config: Source("camera:0", "wall", film))
+    monkeypatch.setattr(shots.time, "monotonic", lambda: now)
     captured = capture("camera:0", tmp_path / "out", 150, 400, 2, seconds=6.0)
     assert captured.images >= 25
     assert captured.seen == (len(pictures) if ends_by == "Ctrl-C" else pytest.approx(60, abs=1))
@@ -235,3 +235,29 @@ def test_a_lens_that_folds_the_corners_over_is_refused_before_anything_is_writte
     with pytest.raises(DatasetError, match=r"folds the images' corners over .*linear mode"):
         capture(str(tmp_path), tmp_path / "out", 150, 400, 1)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_video_that_is_cut_off_is_told(
+    pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def film(first: int) -> Iterator[CapturedFrame]:
+        yield from (CapturedFrame(i, picture, "rgb8", LENS, f"{i}") for i, picture in enumerate(pictures))
+
+    for length, notes in ((41, ()), (100, ("only 40 of 100 frames could be read: is the file whole?",))):
+        source = Source("video", "own", film, length)
+        monkeypatch.setattr(shots, "open_source", lambda config, source=source: source)
+        assert capture("mcap:a", tmp_path / f"{length}", 150, 400, 2).notes == notes
+
+
+def test_cameras_that_cannot_be_adjusted_stay_as_mapped_and_that_is_told(
+    pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none(*arguments: object) -> None:
+        raise GeometryError("no camera")
+
+    for i, picture in enumerate(pictures[::3]):
+        Image.fromarray(picture).save(tmp_path / f"{i:02d}.png")
+    monkeypatch.setattr("fieldpose.stages.structure.adjustment.adjust", none)
+    captured = capture(str(tmp_path), tmp_path / "out", 150, 400, 2)
+    assert captured.images == 14
+    assert captured.notes == ("the cameras are as they were mapped, since adjusting them all found none (no camera)",)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fieldpose.stages.geometry.cameras import Camera
-from fieldpose.stages.geometry.rigid import camera_centre
+from fieldpose.stages.geometry.rigid import camera_centre, nearest_point_to_axes
 
 _AROUND_THE_VIEW = 1.05
 _AROUND_THE_CAMERAS = 1.05
@@ -64,24 +64,6 @@ def unbounded_bounds(poses: Sequence[np.ndarray], depths: tuple[float, float] | 
     near = _NEAR_SHARE_OF_RADIUS * radius if depths is None else 0.9 * depths[0]
     aabb = np.stack([centre - radius, centre + radius])
     return SceneBounds(centre, radius, aabb, near, None if depths is None else depths[1])
-
-
-def nearest_point_to_axes(poses: Sequence[np.ndarray]) -> np.ndarray:
-    """The point (3,) with the least sum of squared distances to the optical axes.
-
-    Where the axes do not meet in front of the cameras: ahead of their middle, as far as the cameras are spread if
-    they all face one way, and in their middle if they look all around.
-    """
-    centres, forwards = _centres(poses), np.stack([cam_from_object[2, :3] for cam_from_object in poses])
-    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]
-    total = across.sum(axis=0)
-    middle = centres.mean(axis=0)
-    if np.linalg.eigvalsh(total)[0] > 1e-6 * len(poses):
-        point = np.linalg.solve(total, (across @ centres[:, :, None]).sum(axis=0)[:, 0])
-        if np.median(np.einsum("ij,ij->i", point - centres, forwards)) > 0:
-            return point
-    spread = float(np.linalg.norm(centres - middle, axis=1).max())
-    return middle + (spread if spread > 0 else 1.0) * _mean_direction(poses)
 
 
 def _mean_direction(poses: Sequence[np.ndarray]) -> np.ndarray:

@@ -20,9 +20,9 @@ from fieldpose.stages.nerf.datasets.records import ImageRecord
 RIGID_TOLERANCE = 1e-3
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 LFS_POINTER = "version https://git-lfs"
-NOT_OURS = frozenset({"scale", "offset", "aabb_scale", "ply_file_path", "applied_transform", "applied_scale", "time"})
+NOT_OURS = frozenset({"scale", "offset", "aabb_scale", "applied_transform", "applied_scale", "time"})
 """Keys that other programs write, alike to some of these files' own."""
-UNSUPPORTED = frozenset({"k5", "k6", "rolling_shutter", "lidar"})
+UNSUPPORTED = frozenset({"k5", "k6", "rolling_shutter"})
 """Keys that say what this reader has no model for, unless they say nothing."""
 _UNSUPPORTED_HOW = "undistort the images to a pinhole camera first, or take the key out if it means nothing"
 _MISSPELT = 0.74

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from fieldpose.stages.geometry import camera_centres, look_at
 from fieldpose.stages.structure.similarity import Similarity
-from fieldpose.stages.structure.upright import dominant_plane, nearest_to_lines, stand
+from fieldpose.stages.structure.upright import dominant_plane, stand
 
 RNG = np.random.default_rng(0)
 FLOOR = np.concatenate([RNG.uniform(-2, 2, (300, 2)), RNG.normal(0, 0.003, (300, 1))], axis=1)
@@ -70,13 +70,3 @@ def test_a_wall_behind_the_thing_is_no_floor() -> None:
 def test_nothing_is_below_a_floor() -> None:
     below = RNG.uniform((-2, -2, -1), (2, 2, -0.1), (400, 3))
     assert dominant_plane(np.concatenate([FLOOR, below]), camera_centres(POSES), np.array([0, 0, 1.0]), 0.02) is None
-
-
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=20, deadline=None)
-def test_the_point_nearest_to_lines_through_a_point_is_that_point(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    point, directions = rng.normal(size=3), rng.normal(size=(5, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = point + rng.uniform(-3, 3, (5, 1)) * directions
-    np.testing.assert_allclose(nearest_to_lines(origins, directions), point, atol=1e-6)

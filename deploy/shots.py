@@ -1,0 +1,162 @@
+"""Images to find cameras for: sharp frames of a video or of a live camera, or photographs, upright and of one lens."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fieldpose.errors import SourceError
+from fieldpose.stages.camera.calibration import ONE_LENS, focal_length_from_exif
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.core import Source
+from fieldpose.stages.camera.sources import is_video, open_source
+from fieldpose.stages.camera.sources.folder import natural
+from fieldpose.stages.images import decoded, shrunk
+from fieldpose.stages.nerf.datasets.images import EXTENSIONS, is_image_name, upright, upright_size
+
+Report = Callable[[str, float], None]
+FILMED_S = 60.0
+"""A live camera films for so long, if it is not told otherwise."""
+_QUALITY = 95
+_WHOLE = 0.9
+"""Of the frames that a video says it has: of fewer, a user is told."""
+_RAW = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw"}
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image to find a camera for: its name in the dataset, the bytes of its upright JPEG file, and its size."""
+
+    name: str
+    jpeg: bytes
+    width: int
+    height: int
+
+    def image(self) -> np.ndarray:
+        """Its pixels (h, w, 3) uint8."""
+        pixels = decoded("jpeg", np.frombuffer(self.jpeg, np.uint8), self.width, self.height)
+        assert pixels is not None, "what was encoded here can be decoded"
+        return pixels
+
+
+@dataclass(frozen=True)
+class Shots:
+    """What was chosen of a source, how many images it has, those left out as blurred, and what is known of the lens.
+
+    focal_px: of the images' own size, None where nothing tells it. follow: whether they follow one another in time.
+    notes: what a user should know, a line each.
+    """
+
+    chosen: tuple[Shot, ...]
+    seen: int
+    blurred: tuple[str, ...]
+    focal_px: float | None
+    follow: bool
+    notes: tuple[str, ...] = ()
+
+
+def read_shots(source: str, most: int, size: int, seconds: float, report: Report) -> Shots:
+    """Of a video file, a folder of photographs, or a source as `run` takes it; see capturing.capture. SourceError."""
+    path = Path(source)
+    if path.is_dir():
+        return _photographs(path, size, report)
+    name = source if ":" in source and not path.exists() else f"video:{source}"
+    if name.startswith("folder:"):
+        return _photographs(Path(name.partition(":")[2]), size, report)
+    if not is_video(name):
+        raise SourceError(f"{source}: expected a video, a camera, a recording or a folder of photographs")
+    return _frames(open_source(CameraConfig(source=name)), most, size, seconds, report)
+
+
+def _photographs(folder: Path, size: int, report: Report) -> Shots:
+    """All images of a folder, upright as their EXIF says, files that are there twice only once.
+
+    Those that stand where most lie, or the other way round, are turned by a quarter: one lens then has one camera.
+    """
+    paths = sorted((p for p in folder.iterdir() if is_image_name(p)), key=natural) if folder.is_dir() else []
+    others = [p.name for p in sorted(folder.iterdir()) if p.suffix.lower() in _RAW] if folder.is_dir() else []
+    left = () if not others else (f"{len(others)} files were not read, as {others[0]}; convert them to JPEG",)
+    if not paths:
+        raise SourceError(f"{folder}: no images in this folder; expected {', '.join(EXTENSIONS)}; {' '.join(left)}")
+    shots: list[Shot] = []
+    focals: list[float] = []
+    known: set[bytes] = set()
+    sizes: set[tuple[int, int]] = set()
+    stems = Counter(path.stem for path in paths)
+    portrait = 2 * sum(height > width for width, height in map(upright_size, paths)) > len(paths)
+    for i, path in enumerate(paths):
+        image = upright(path)
+        if (image.shape[0] > image.shape[1]) != portrait and image.shape[0] != image.shape[1]:
+            image = np.ascontiguousarray(np.rot90(image))
+        sizes.add((image.shape[1], image.shape[0]))
+        shot = _shot(f"{path.stem}.jpg" if stems[path.stem] == 1 else f"{path.name}.jpg", image, size)
+        if shot.jpeg in known:
+            continue
+        known.add(shot.jpeg)
+        shots.append(shot)
+        focal = focal_length_from_exif(path, shot.width, shot.height)
+        focals += [] if focal is None else [focal]
+        report("reading the photographs", (i + 1) / len(paths))
+    _check_shapes(folder, sizes)
+    if focals and max(focals) > ONE_LENS * min(focals):
+        raise SourceError(
+            f"{folder}: photographs of several lenses (EXIF tells of focal lengths of {min(focals):.0f} to"
+            f" {max(focals):.0f} px); keep those of one lens, without zoom"
+        )
+    focal = float(np.median(focals)) if len(focals) == len(shots) else None
+    return Shots(tuple(shots), len(paths), (), focal, False, left)
+
+
+def _check_shapes(source: Path | str, sizes: set[tuple[int, int]]) -> None:
+    if len(sizes) > 1:
+        named = ", ".join(f"{w}x{h}" for w, h in sorted(sizes))
+        raise SourceError(
+            f"{source}: images of several sizes ({named}), so of several cameras; keep those of one camera"
+        )
+
+
+def _frames(source: Source, most: int, size: int, seconds: float, report: Report) -> Shots:
+    from fieldpose.stages.structure.selection import Chooser, Meter
+
+    meter, chooser = Meter(), Chooser[Shot](most)
+    live, began = source.clock == "wall", time.monotonic()
+    sizes: set[tuple[int, int]] = set()
+    try:
+        for image in _images(source):
+            measured, filmed_s = meter(image), time.monotonic() - began
+            sizes.add((image.shape[1], image.shape[0]))
+            if chooser.wants(measured):
+                chooser.keep(measured, _shot(f"{chooser.seen - 1:05d}.jpg", image, size))
+            if live and filmed_s >= seconds:
+                break
+            share = filmed_s / seconds if live else chooser.seen / source.length if source.length else 0.0
+            report("filming" if live else "choosing frames", min(share, 1.0))
+    except KeyboardInterrupt:
+        if not live:
+            raise
+    _check_shapes(source.description, sizes)
+    cut = not live and source.length is not None and chooser.seen < _WHOLE * source.length
+    notes = (f"only {chooser.seen} of {source.length} frames could be read: is the file whole?",) if cut else ()
+    chosen, blurred = chooser.chosen()
+    return Shots(
+        tuple(c.payload for c in chosen), chooser.seen, tuple(c.payload.name for c in blurred), None, True, notes
+    )
+
+
+def _images(source: Source) -> Iterator[np.ndarray]:
+    for frame in source.frames(0):
+        image = decoded(frame.encoding, frame.image, frame.camera.width, frame.camera.height)
+        if image is not None:
+            yield image
+
+
+def _shot(name: str, image: np.ndarray, size: int) -> Shot:
+    image = shrunk(image, size)
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return Shot(name, jpeg.tobytes(), image.shape[1], image.shape[0])

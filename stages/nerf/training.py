@@ -40,7 +40,7 @@ OCCUPANCY_EVERY = (16, 32, 64)
 FREE_SHARE = 0.2
 LATE, WITHIN, UNTIL = 0.5, 0.6, 0.5
 """Share of the rays that begin late, in the beginning; up to where, of the distance to what the cameras look at; and
-when, of the training, the last one does. A papered room has 27 dB by it; without, haze wins: 15. Fox gains 0.5."""
+when, of the training, the last one does. A papered room has 27 dB by it; without, haze wins: 15."""
 DISTORTION = {False: 1e-2, True: 5e-2}
 REWEIGH_EVERY = 32
 STRIDE = {False: 1.5, True: 1.0}

@@ -20,6 +20,7 @@ from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.field import load_field
 from fieldpose.stages.nerf.loading import load_renderer
 from fieldpose.stages.nerf.metadata import FieldMetadata, Space
+from fieldpose.stages.nerf.raybank import Batch
 from fieldpose.stages.nerf.renderer import NumbaRenderer
 from fieldpose.stages.nerf.torch_renderer import torch_device
 from fieldpose.stages.nerf.torch_training import TorchTrainer
@@ -151,3 +152,19 @@ def test_a_bad_dataset_leaves_no_field(tmp_path: Path) -> None:
 def test_cuda_without_a_device_is_refused() -> None:
     with pytest.raises(ConfigError, match="no CUDA device"):
         torch_device("cuda")
+
+
+def test_rays_that_begin_late_are_learnt_from_and_not_judged_by(monkeypatch: pytest.MonkeyPatch) -> None:
+    trainer = Trainer(list(views()), SPACE, SMALL, TrainingConfig(steps=10, threads=1, samples_per_step=6000))
+    centres = {tuple(origin) for origin in trainer._bank._origin}
+    shares = []
+
+    def learn(batch: Batch, jitter: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray, int]:
+        late = np.array([tuple(origin) not in centres for origin in batch.origins])
+        shares.append(float(late.mean()))
+        return late.astype(np.float32), np.zeros(len(late), np.float32), len(late)
+
+    monkeypatch.setattr(trainer, "learn", learn)
+    assert [trainer.step(fraction) for fraction in (0.0, 0.25, 0.5)] == [0, 0, 0]
+    assert not trainer._bank.blocks.error.any()
+    assert shares == pytest.approx([0.5, 0.25, 0.0], abs=0.1)

@@ -126,7 +126,8 @@ def _camera(parts: Parts, launch: Launch) -> Handler:
 def _perturbation(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.deploy.evaluation.perturbation import PerturbationNode
 
-    return PerturbationNode(parts.plan.begins.disturbance, parts.settings.tracking.seed)
+    plan = parts.plan
+    return PerturbationNode(plan.begins.disturbance, plan.settings.tracking.seed, plan.object_from_dataset())
 
 
 def _tracking(parts: Parts, launch: Launch) -> Handler:

@@ -12,8 +12,10 @@ from fieldpose.errors import ConfigError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.sources import is_video, knows_truth
 from fieldpose.stages.following.config import FollowingConfig
+from fieldpose.stages.geometry import Similarity
 from fieldpose.stages.nerf.backend import resolved
 from fieldpose.stages.nerf.config import Backend
+from fieldpose.stages.nerf.field import load_metadata
 from fieldpose.stages.nerf.training_views import TrainingViews
 from fieldpose.stages.refinement.config import RefinementConfig
 from fieldpose.stages.rendering.config import RenderingConfig
@@ -50,6 +52,12 @@ class Plan:
     def in_flight(self) -> int:
         """How many frames are solved at once: one in lockstep, and where all are followed, whatever the depth is."""
         return 1 if self.follows or self.settings.camera.pace == "lockstep" else self.settings.tracking.depth
+
+    def object_from_dataset(self) -> Similarity:
+        """From the frame of true poses, the dataset's, into the field's. Raises FieldFileError."""
+        if self.field is None:
+            return Similarity.identity()
+        return load_metadata(self.field).frame.object_from_dataset
 
 
 def resolve(settings: Settings, views: TrainingViews | None, field: Path | None = None) -> Plan:

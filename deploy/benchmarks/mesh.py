@@ -19,6 +19,7 @@ from fieldpose.stages.nerf.datasets import Dataset, load_dataset
 from fieldpose.stages.nerf.field import Field, load_field
 from fieldpose.stages.nerf.kernels.density import densities
 from fieldpose.stages.nerf.loading import make_renderer
+from fieldpose.stages.nerf.normalise import normalised_points
 from fieldpose.stages.nerf.surface.extract import region_of, seen_surface, surface_mesh
 from fieldpose.stages.nerf.surface.fusion import BLOCK, grid_over
 from fieldpose.stages.nerf.surface.marching import Piece, isosurface, joined
@@ -46,7 +47,8 @@ class Truth:
 
 def measure(path: Path, dataset: Path, resolution: int, report: Callable[[str], None]) -> dict[str, Any]:
     """Both ways on a field of a dataset whose test views have true depth. Raises DatasetError where they have none."""
-    field, data = load_field(path), load_dataset(dataset, "test", None)
+    field = load_field(path)
+    data = load_dataset(dataset, "test", None).in_frame(field.metadata.frame.object_from_dataset)
     if any(record.depth_path is None for record in data.images):
         raise DatasetError(f"{dataset}: the test views have no true depth, by which a mesh could be measured")
     truth, region = true_surface(data), region_of(field.metadata.space)
@@ -79,7 +81,7 @@ def level_set(field: Field, resolution: int, at: float) -> Mesh:
     pieces: list[Piece] = []
     for block in np.ndindex(*grid.blocks):
         start = np.array([block]) * BLOCK
-        u = ((grid.low + grid.cell * (start + offsets) - space.centre) / space.scale + 1) / 2
+        u = (normalised_points(space, grid.low + grid.cell * (start + offsets)) + 1) / 2
         wanted = _occupied(field, u)
         opacity = np.zeros((1, *wanted.shape), np.float32)
         opacity[0, wanted] = 1 - np.exp(-step * _densities(field, workers, u[wanted].astype(np.float32)))

@@ -100,7 +100,8 @@ class Options:
         field = load_field(self.field)
         names = self._methods(recalls=field.descriptors is not None)
         renderer = make_renderer(field, threads=0, backend=self.settings.backend)
-        dataset, surface = load_dataset(self.dataset, "test", self.size), self._surface(field, renderer)
+        dataset = load_dataset(self.dataset, "test", self.size).in_frame(field.metadata.frame.object_from_dataset)
+        surface = self._surface(field, renderer)
         protocol = self._protocol(surface)
         drawn = pairs.draw(protocol, [record.cam_from_object for record in dataset.images], self.seeds)
         images, covered = shown(dataset, drawn, self._thing(protocol))
@@ -108,7 +109,7 @@ class Options:
         warm_up(renderer, jacobian=True)
         about = {
             "protocol": dataclasses.asdict(protocol),
-            "unit": dataset.unit,
+            "unit": field.metadata.unit,
             "pairs": len(drawn),
             "seeds": list(self.seeds),
             "covered": covered,

@@ -1,4 +1,4 @@
-"""What a recording holds."""
+"""What a recording holds, or a field says of itself."""
 
 from __future__ import annotations
 
@@ -19,30 +19,45 @@ from fieldpose.deploy.reporting.output import result_console, write_json
 from fieldpose.deploy.reporting.provenance import EDIT_RECORD, PLAN_RECORD, RUN_RECORD
 from fieldpose.deploy.reporting.report import CAMERA_ORIGINS
 
+FIELD_SUFFIX = ".safetensors"
+
 
 @dataclass(frozen=True)
 class Options:
-    """List what a recording holds, topic by topic, with what each sender's own numbers say is missing.
+    """List what a recording holds, topic by topic, with what each sender's own numbers say is missing; or what a field
+    says of itself: how well it was learnt, and in which frame and unit its poses are.
 
     Example: fieldpose info out/lego.mcap
 
-    The JSON file has: path, size_bytes, messages, first_ns, last_ns, lossless, topics (key, topic, messages,
-    first_ns, last_ns, rate_hz), sources (key, source, received, written, missing), metadata, attachments (bytes),
-    cameras (where the intrinsics of frames come from -> how many).
+    The JSON file of a field has what its file says besides the arrays. That of a recording has: path, size_bytes,
+    messages, first_ns, last_ns, lossless, topics (key, topic, messages, first_ns, last_ns, rate_hz), sources (key,
+    source, received, written, missing), metadata, attachments (bytes), cameras (where the intrinsics of frames come
+    from -> how many).
     """
 
-    recording: tyro.conf.Positional[Path]
-    """The recording (.mcap)."""
+    file: tyro.conf.Positional[Path]
+    """The recording (.mcap) or the field (.safetensors)."""
     json: Path | None = None
     """Write the same into this file."""
 
     def run(self) -> int:
-        """Print the tables."""
-        recording, cameras = info(self.recording), _cameras(self.recording)
+        """Print what it is."""
+        if self.file.suffix == FIELD_SUFFIX:
+            return self._field()
+        recording, cameras = info(self.file), _cameras(self.file)
         write_json(self.json, {**asdict(recording), "cameras": cameras})
         console = result_console()
         console.print("\n".join(_description(recording, cameras)), highlight=False, soft_wrap=True)
         console.print(_topics(recording))
+        return 0
+
+    def _field(self) -> int:
+        from fieldpose.deploy.reporting.fields import field_in_words
+        from fieldpose.stages.nerf.field import load_field
+
+        field = load_field(self.file)
+        write_json(self.json, field.metadata)
+        result_console().print("\n".join(field_in_words(self.file, field)), highlight=False, soft_wrap=True)
         return 0
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from fieldpose.bus.messages import Message, Prior, Truth
 from fieldpose.bus.node import Output, reply_header
 from fieldpose.bus.topics import PRIOR, TRUTH, Topic
-from fieldpose.stages.geometry import perturb
+from fieldpose.stages.geometry import Similarity, perturb
 from fieldpose.stages.tracking.beginning import Disturbance
 
 
@@ -18,14 +18,18 @@ class PerturbationNode:
     """A Handler that answers each frame's true pose with that pose, disturbed as in the paper's section V-B.
 
     A frame's disturbance depends on the seed and its frame_id alone; an object out of view has none.
+    object_from_dataset: from the frame of true poses into that of guesses.
     """
 
     name = "perturbation"
     inputs: tuple[Topic[Any], ...] = (TRUTH,)
     outputs: tuple[Topic[Any], ...] = (PRIOR,)
 
-    def __init__(self, disturbance: Disturbance | None, seed: int) -> None:
+    def __init__(
+        self, disturbance: Disturbance | None, seed: int, object_from_dataset: Similarity | None = None
+    ) -> None:
         self._disturbance, self._seed = disturbance or Disturbance(), seed
+        self._object_from_dataset = object_from_dataset or Similarity.identity()
 
     def start(self) -> None:
         """Nothing to load."""
@@ -35,7 +39,8 @@ class PerturbationNode:
         if truth is None:
             return
         rng = np.random.default_rng([self._seed, message.header.frame_id])
-        guess = perturb(np.array(truth), rng, self._disturbance.angle_deg, self._disturbance.max_translation)
+        pose = self._object_from_dataset.of_poses(np.array(truth, np.float64)[None])[0]
+        guess = perturb(pose, rng, self._disturbance.angle_deg, self._disturbance.max_translation)
         yield PRIOR, Prior(header=reply_header(message.header), cam_from_object=guess)
 
     def tick(self, now_ns: int) -> Iterator[Output]:

@@ -18,6 +18,7 @@ from fieldpose.bus.topics import FRAME, GUESS, STATE, STATS, TRUTH, Address, Top
 from fieldpose.deploy.graph import BETWEEN_STAGES, CAMERA
 from fieldpose.deploy.reporting.results import FrameResult, Outcome, TruthKnown
 from fieldpose.errors import CodecError
+from fieldpose.stages.geometry import Similarity
 
 _TIMED = (FRAME, *BETWEEN_STAGES)
 _READ = (STATE, TRUTH, STATS)
@@ -35,16 +36,18 @@ class _Seen:
     sent: list[tuple[int, str]] = field(default_factory=list)
     passes: int = 0
     state: State | None = None
-    truth: Truth | None = None
+    truth: TruthKnown | None = None
 
 
 class Collector:
     """Listens to one pipeline; images are counted and timed by their headers, never decoded.
 
-    The newest 100,000 frames are kept.
+    The newest 100,000 frames are kept. object_from_dataset: into the frame that poses are in; true ones are in that of
+    the dataset.
     """
 
-    def __init__(self, bus: Bus, address: Address) -> None:
+    def __init__(self, bus: Bus, address: Address, object_from_dataset: Similarity | None = None) -> None:
+        self._object_from_dataset = object_from_dataset or Similarity.identity()
         self.stats: dict[str, Stats] = {}
         self.newest_state: State | None = None
         self.observed: Counter[str] = Counter()
@@ -108,7 +111,11 @@ class Collector:
                 self.newest_state = self._seen(message.header).state = message
                 self._reported_ns.append(message.header.sent_ns)
             case Truth():
-                self._seen(message.header).truth = message
+                self._seen(message.header).truth = TruthKnown(self._in_frame(message.cam_from_object))
+
+    def _in_frame(self, pose: np.ndarray | None) -> np.ndarray | None:
+        known = _copied(pose)
+        return None if known is None else self._object_from_dataset.of_poses(known[None])[0]
 
     def _seen(self, header: Header) -> _Seen:
         # The capture time tells a camera's frames from those of one that began again.
@@ -138,7 +145,7 @@ def _result(frame_id: int, seen: _Seen) -> FrameResult:
         cam_from_object=_copied(found),
         carried=_copied(state.cam_from_object) if state is not None and found is None else None,
         covariance=None if found is None or state is None else _copied(state.covariance),
-        truth=None if seen.truth is None else TruthKnown(_copied(seen.truth.cam_from_object)),
+        truth=seen.truth,
         sent_ns=seen.camera_sent_ns,
         answered_ns=None if state is None else state.header.sent_ns,
         stage_ms=_stage_ms(seen),

@@ -115,7 +115,9 @@ class _Running:
         began = time.monotonic()
         bus = ZenohBus(self._hub, peer_address(self._hub))
         try:
-            self._collectors = [Collector(bus, plan.settings.address) for plan in self._plans]
+            self._collectors = [
+                Collector(bus, plan.settings.address, plan.object_from_dataset()) for plan in self._plans
+            ]
             token = bus.hold(self._plans[0].settings.address.live(OBSERVER))
             start_s = self._start(bus) - began
             # Where other programs send the frames, it is Ctrl-C that ends the source.

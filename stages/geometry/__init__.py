@@ -27,12 +27,14 @@ from fieldpose.stages.geometry.rigid import (
     rotation_about,
 )
 from fieldpose.stages.geometry.sampling import perturb
+from fieldpose.stages.geometry.similarity import Similarity
 from fieldpose.stages.geometry.uncertainty import twist_covariance
 
 __all__ = [
     "RIGID_TOLERANCE",
     "Camera",
     "Limit",
+    "Similarity",
     "adjoint",
     "camera_centre",
     "camera_centres",

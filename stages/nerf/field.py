@@ -107,22 +107,39 @@ def net_of(config: FieldConfig, learnt: Mapping[str, np.ndarray]) -> Net:
 
 def load_field(path: Path) -> Field:
     """Read a field file. Raises FieldFileError, naming the file, for anything that is not one of this version."""
+    header, arrays = _read(path)
+    metadata = _metadata(path, header)
+    try:
+        return _assemble(arrays, metadata)
+    except (KeyError, ValueError) as error:
+        raise FieldFileError(f"{path}: damaged field file ({error}); train it again") from error
+
+
+def load_metadata(path: Path) -> FieldMetadata:
+    """What a field file says of itself, without its arrays. Raises FieldFileError."""
+    return _metadata(path, _read(path, arrays=False)[0])
+
+
+def _read(path: Path, arrays: bool = True) -> tuple[dict[str, str], dict[str, np.ndarray]]:
     if not path.is_file():
         raise FieldFileError(f"{path}: no such field file; `fieldpose train DATASET --out {path}` makes one")
     try:
         with safe_open(path, framework="numpy") as file:
-            header = file.metadata() or {}
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
+            names = file.keys() if arrays else ()
+            return file.metadata() or {}, {name: file.get_tensor(name) for name in names}
     except (SafetensorError, OSError) as error:
         raise FieldFileError(f"{path}: not a safetensors field file ({error}); train it again") from error
+
+
+def _metadata(path: Path, header: Mapping[str, str]) -> FieldMetadata:
     if header.get("version") != str(FORMAT_VERSION) or "fieldpose" not in header:
         got = header.get("version", "none")
         raise FieldFileError(
             f"{path}: field format version {got}, this program reads {FORMAT_VERSION}; train the field again"
         )
     try:
-        return _assemble(arrays, msgspec.json.decode(header["fieldpose"], type=FieldMetadata))
-    except (msgspec.DecodeError, KeyError, ValueError) as error:
+        return msgspec.json.decode(header["fieldpose"], type=FieldMetadata)
+    except (msgspec.DecodeError, ValueError) as error:
         raise FieldFileError(f"{path}: damaged field file ({error}); train it again") from error
 
 

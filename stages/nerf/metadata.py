@@ -7,16 +7,20 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from fieldpose.stages.geometry import Camera
+from fieldpose.stages.geometry import Camera, Similarity
 from fieldpose.stages.nerf.config import FieldConfig
 
 FORMAT_VERSION = 1
 DESCRIBED_SIZE = 400
 """Longer side to which larger images are shrunk before they are described."""
 
+Rows3 = tuple[float, float, float, float, float, float, float, float, float]
+"""A 3x3 matrix by rows."""
+UNTURNED: Rows3 = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
 
 class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """From object coordinates to the field's: y = (x - centre) / scale.
+    """From object coordinates to the field's: y = rotation (x - centre) / scale.
 
     A bounded field fills the box |y| <= half; a contracted one all space, the unit ball at full resolution.
     `near`, `far` and `step` are lengths in y.
@@ -29,6 +33,29 @@ class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     near: float = 0.0
     far: float = 8.0
     step: float = 2.0 / 384
+    rotation: Rows3 = UNTURNED
+
+    @property
+    def turn(self) -> np.ndarray:
+        """rotation as a matrix (3, 3) float64."""
+        return np.reshape(np.array(self.rotation, np.float64), (3, 3))
+
+
+class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """From the dataset's coordinates to those that the field is used by: x = scale * rotation d + translation.
+
+    unit: the dataset's, where the field has another one.
+    """
+
+    scale: float = 1.0
+    rotation: Rows3 = UNTURNED
+    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    unit: str | None = None
+
+    @property
+    def object_from_dataset(self) -> Similarity:
+        """As a similarity."""
+        return Similarity(self.scale, np.reshape(np.array(self.rotation), (3, 3)), np.array(self.translation))
 
 
 class TrainingCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -102,6 +129,7 @@ class FieldMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     dataset_sha256: str
     unit: str = "dataset unit"
     metres_per_unit: float | None = None
+    frame: Frame = Frame()
     has_background: bool = True
     psnr_db: float | None = None
     accuracy: PoseAccuracy | None = None

@@ -11,6 +11,7 @@ from fieldpose.stages.geometry.cameras import Camera
 from fieldpose.stages.nerf.kernels.density import raise_to
 from fieldpose.stages.nerf.kernels.types import BLOCK
 from fieldpose.stages.nerf.metadata import Space
+from fieldpose.stages.nerf.normalise import normalised_points, object_points
 
 LEAST_OPACITY = 0.01
 
@@ -46,7 +47,7 @@ def from_cube(space: Space, u: np.ndarray) -> np.ndarray:
         with np.errstate(divide="ignore", invalid="ignore"):
             radius = np.where(norm <= 1, norm, np.where(norm < 2, 1 / (2 - norm), np.nan))
             y = np.where(norm > 0, z * (radius / norm), 0.0)
-    return y * space.scale + np.array(space.centre)
+    return object_points(space, y)
 
 
 def cell_radii(space: Space, n: int, points: np.ndarray) -> np.ndarray:
@@ -54,7 +55,7 @@ def cell_radii(space: Space, n: int, points: np.ndarray) -> np.ndarray:
     half = np.sqrt(3) * space.scale / n
     if not space.contracted:
         return np.full(len(points), half)
-    distance = np.linalg.norm(points - np.array(space.centre), axis=1) / space.scale
+    distance = np.linalg.norm(normalised_points(space, points), axis=1)
     return 2 * half * np.maximum(distance, 1) ** 2
 
 

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fieldpose.stages.geometry import camera_centres
 from fieldpose.stages.nerf.blocks import Blocks, View
 from fieldpose.stages.nerf.metadata import Space
+from fieldpose.stages.nerf.normalise import normalised_points
 
 
 @dataclass(frozen=True)
@@ -38,9 +40,9 @@ class RayBank:
         map_starts = np.concatenate([[0], np.cumsum([len(m) for m in maps])])
         self._directions = np.concatenate(maps)
         self._map_start = np.array([map_starts[cameras.index(v.camera)] for v in views])
-        self._rotation = np.stack([v.cam_from_object[:3, :3].T for v in views]).astype(np.float32)
-        centres = np.stack([-v.cam_from_object[:3, :3].T @ v.cam_from_object[:3, 3] for v in views])
-        self._origin = ((centres - np.array(space.centre)) / space.scale).astype(np.float32)
+        self._rotation = np.stack([space.turn @ v.cam_from_object[:3, :3].T for v in views]).astype(np.float32)
+        centres = camera_centres(np.stack([v.cam_from_object for v in views]))
+        self._origin = normalised_points(space, centres).astype(np.float32)
         self._background = views[0].background
         masked = any(v.learnt is not None for v in views)
         self._learnt = np.concatenate([_learnt(v) for v in views]) if masked else None

@@ -12,7 +12,7 @@ from fieldpose.stages.nerf.kernels.sight import block_centres, block_radius, til
 from fieldpose.stages.nerf.kernels.types import Net
 from fieldpose.stages.nerf.kernels.vectors import WIDTH, reads_half_floats
 from fieldpose.stages.nerf.metadata import FieldMetadata
-from fieldpose.stages.nerf.normalise import by_object_rays, normalised
+from fieldpose.stages.nerf.normalise import by_object_rays, normalised, normalised_points
 from fieldpose.stages.nerf.rendering_api import RenderedRays, RenderedView
 from fieldpose.stages.nerf.tiles import TILE, view_tiles
 from fieldpose.stages.nerf.workers import Workers
@@ -91,8 +91,8 @@ class NumbaRenderer:
         """See RayRenderer."""
         space, tiles = self.metadata.space, view_tiles(camera)
         limits = self._limits(camera, cam_from_object)
-        turn = np.ascontiguousarray(cam_from_object[:3, :3], np.float32)
-        origin = ((camera_centre(cam_from_object) - space.centre) / space.scale).astype(np.float32)
+        turn = np.ascontiguousarray(cam_from_object[:3, :3] @ space.turn.T, np.float32)
+        origin = normalised_points(space, camera_centre(cam_from_object)).astype(np.float32)
         n, shape = len(tiles.pixel), (camera.height, camera.width)
         rgb, depth, opacity = np.empty((n, 3), np.uint8), np.empty(n, np.float32), np.empty(n, np.float32)
         evaluated = self._workers.each(
@@ -115,9 +115,9 @@ class NumbaRenderer:
         if self._centres is None:
             return _everywhere(rows * columns)
         limits = np.empty((rows, columns, 2), np.float32)
-        origin = (camera_centre(cam_from_object) - space.centre) / space.scale
+        origin = normalised_points(space, camera_centre(cam_from_object))
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        turn = np.ascontiguousarray(cam_from_object[:3, :3])
+        turn = np.ascontiguousarray(cam_from_object[:3, :3] @ space.turn.T)
         tile_limits(self._centres, block_radius(self._domain), turn, origin, intrinsics, TILE, limits)
         return limits.reshape(-1, 2)
 

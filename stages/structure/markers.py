@@ -13,9 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from fieldpose.stages.geometry import Similarity
 from fieldpose.stages.geometry.arrays import Matrix3, Points64
 from fieldpose.stages.structure.posed import PosedCameras
-from fieldpose.stages.structure.similarity import Similarity
 from fieldpose.stages.structure.tracks import Tracks
 from fieldpose.stages.structure.triangulation import triangulate
 

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fieldpose.stages.geometry import camera_centres, nearest_point_to_axes
+from fieldpose.stages.geometry import Similarity, camera_centres, nearest_point_to_axes
 from fieldpose.stages.geometry.arrays import Points64, Transforms, Vector
-from fieldpose.stages.structure.similarity import Similarity
 
 _TRIALS = 2000
 _THICKNESS = 0.02
@@ -38,12 +37,27 @@ class Standing:
 def stand(cam_from_map: Transforms, points: Points64) -> Standing:
     """A frame for cameras (n, 4, 4) and what they show (m, 3)."""
     centres, focus = camera_centres(cam_from_map), nearest_point_to_axes(cam_from_map)
-    unit = float(np.median(np.linalg.norm(centres - focus, axis=1)))
-    around = mean_up(cam_from_map)
-    plane = dominant_plane(points, centres, around, _THICKNESS * unit)
-    up, origin = (around, focus) if plane is None else (plane[0], focus - (plane[0] @ focus - plane[1]) * plane[0])
+    unit = distance_of_focus(cam_from_map)
+    plane = plane_under(cam_from_map, points)
+    up, origin = (
+        (mean_up(cam_from_map), focus)
+        if plane is None
+        else (plane[0], focus - (plane[0] @ focus - plane[1]) * plane[0])
+    )
     rotation = _upright(up, centres[0] - focus)
     return Standing(Similarity(1 / unit, rotation, -rotation @ origin / unit), plane is not None)
+
+
+def plane_under(cam_from_map: Transforms, points: Points64) -> tuple[Vector, float] | None:
+    """What the object stands on that cameras (n, 4, 4) look at, of what they show (m, 3); see dominant_plane."""
+    thickness = _THICKNESS * distance_of_focus(cam_from_map)
+    return dominant_plane(points, camera_centres(cam_from_map), mean_up(cam_from_map), thickness)
+
+
+def distance_of_focus(cam_from_map: Transforms) -> float:
+    """Median distance of cameras (n, 4, 4) from what they look at."""
+    apart = camera_centres(cam_from_map) - nearest_point_to_axes(cam_from_map)
+    return float(np.median(np.linalg.norm(apart, axis=1)))
 
 
 def mean_up(cam_from_map: Transforms) -> Vector:

@@ -29,7 +29,7 @@ from fieldpose.bus.topics import CAMERA_INFO, GUESS, POSE, PRIOR, TRUTH, Topic
 from fieldpose.deploy.evaluation.perturbation import PerturbationNode
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.node import CameraNode
-from fieldpose.stages.geometry import camera_centre, is_rigid, rotation_error_deg
+from fieldpose.stages.geometry import Similarity, camera_centre, is_rigid, rotation_about, rotation_error_deg
 from fieldpose.stages.tracking.beginning import Disturbance, beginning, make_policy
 from fieldpose.stages.tracking.config import TrackingConfig
 from fieldpose.stages.tracking.core import Tracker
@@ -90,6 +90,13 @@ def test_disturbances_repeat_by_seed_and_frame_in_whatever_order_the_frames_come
         np.testing.assert_array_equal(forwards[i], backwards[i])
         assert not np.allclose(forwards[i], other[i])
     assert not np.allclose(forwards[0], forwards[1])
+
+
+def test_guesses_are_in_the_fields_frame_where_that_is_another_than_the_truths() -> None:
+    truth = on_sphere(20, 30)
+    moved = Similarity(2.5, rotation_about(np.array([1.0, 2.0, 3.0]), 0.7)[:3, :3], np.array([1.0, -2.0, 0.5]))
+    guess = priors(PerturbationNode(Disturbance((0.0, 0.0), 0.0), 5, moved), [3], truth)[3]
+    np.testing.assert_allclose(guess, moved.of_poses(truth[None])[0], atol=1e-9)
 
 
 def test_an_object_out_of_view_has_no_guess() -> None:

@@ -33,7 +33,7 @@ from fieldpose.bus.topics import (
 from fieldpose.deploy.graph import STAGES
 from fieldpose.deploy.processes.collector import Collector
 from fieldpose.deploy.reporting.results import FrameResult, RunResult, TruthKnown, accuracy, rate_hz, summarise, to_csv
-from fieldpose.stages.geometry import exp_se3
+from fieldpose.stages.geometry import Similarity, exp_se3, rotation_about
 
 ADDRESS = Address("test", "mug", "cam")
 
@@ -215,6 +215,19 @@ def test_the_documented_keys_are_there(collected: tuple[Collector, dict[str, Out
     assert set(summary["latency_ms"]["by_stage"]["matching"]) == {"p50", "p90"}
     assert summary["processes"]["pnp"]["rss_mb"] > 0
     assert collector.rate_hz(collector.results()[0].answered_ns or 0) > 0
+
+
+def test_true_poses_are_brought_into_the_fields_frame() -> None:
+    bus = MemoryBus()
+    moved = Similarity(2.0, rotation_about(np.array([1.0, 2.0, 3.0]), 0.7)[:3, :3], np.array([1.0, -2.0, 0.5]))
+    collector, outbox = Collector(bus, ADDRESS, moved), Outbox(bus, ADDRESS, "camera")
+    outbox.publish(FRAME, bus_samples.frame(0))
+    outbox.publish(TRUTH, bus_samples.truth(0))
+    collector.update()
+    (row,) = collector.results()
+    truth = np.array(bus_samples.truth(0).cam_from_object)
+    np.testing.assert_allclose(row.true_pose, moved.of_poses(truth[None])[0], atol=1e-12)
+    collector.close()
 
 
 def test_frames_that_the_command_has_not_heard_count_as_sent() -> None:

@@ -53,8 +53,11 @@ class Region:
 
 
 def region_of(space: Space) -> Region:
-    """The box of a bounded field; of a contracted one the ball that it has at full resolution."""
+    """The box of a bounded field, or the one around it where it is turned; of a contracted one the ball that it has at
+    full resolution."""
     middle, half = np.array(space.centre), np.array(space.half) * space.scale
+    if not space.contracted:
+        half = np.abs(space.turn.T) @ half
     return Region(np.stack([middle - half, middle + half]), ball=space.contracted, exact=space.contracted)
 
 

@@ -7,10 +7,9 @@ import pytest
 from support.papered_room import cameras_before_a_wall, photograph
 from support.wall_marker import CORNERS, MIDDLE, NUMBER, SIZE, with_marker
 
-from fieldpose.stages.geometry import Camera, camera_centres
+from fieldpose.stages.geometry import Camera, Similarity, camera_centres
 from fieldpose.stages.structure.markers import Seen, find_markers, place_marker
 from fieldpose.stages.structure.posed import PosedCameras
-from fieldpose.stages.structure.similarity import Similarity
 
 CAMERA = Camera(640, 480, 520.0, 520.0, 319.5, 239.5, (-0.05, 0.0, 0.0, 0.0, 0.0))
 TRUTH = cameras_before_a_wall(CAMERA, 8)

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.papered_room import cameras_around, cameras_before_a_wall, disturbed
 
-from fieldpose.stages.geometry import Camera, camera_centres, rotation_about
-from fieldpose.stages.structure.similarity import Similarity, align
+from fieldpose.stages.geometry import Camera, Similarity, camera_centres, rotation_about
+from fieldpose.stages.structure.similarity import align
 
 CAMERA = Camera(320, 240, 250.0, 250.0, 159.5, 119.5)
 POSES = cameras_around(CAMERA, 12).cam_from_object
@@ -39,6 +39,17 @@ def test_points_are_seen_as_before(moved: Similarity) -> None:
     for pose, away in zip(POSES, moved.of_poses(POSES), strict=True):
         before, after = points @ pose[:3, :3].T + pose[:3, 3], there @ away[:3, :3].T + away[:3, 3]
         np.testing.assert_allclose(after, moved.scale * before, atol=1e-9 * (1 + np.abs(after).max()))
+
+
+@given(similarities(), similarities())
+def test_one_after_the_other_is_one_and_its_inverse_undoes_it(first: Similarity, second: Similarity) -> None:
+    points = np.random.default_rng(1).normal(size=(5, 3))
+    both = second.after(first)
+    size = 1 + np.abs(both.translation).max() + both.scale
+    np.testing.assert_allclose(both.of_points(points), second.of_points(first.of_points(points)), atol=1e-11 * size)
+    again = both.inverse().of_points(both.of_points(points))
+    np.testing.assert_allclose(again, points, atol=1e-11 * size / both.scale)
+    np.testing.assert_array_equal(Similarity.identity().after(first).of_points(points), first.of_points(points))
 
 
 def test_cameras_that_are_as_wanted_stay() -> None:

@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from fieldpose.stages.geometry import camera_centres, look_at
-from fieldpose.stages.structure.similarity import Similarity
+from fieldpose.stages.geometry import Similarity, camera_centres, look_at
 from fieldpose.stages.structure.upright import dominant_plane, stand
 
 RNG = np.random.default_rng(0)

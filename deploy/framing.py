@@ -1,0 +1,139 @@
+"""A frame and a unit for a field: from what a user says of points, directions and lengths in it."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from fieldpose.errors import ConfigError, UsageError
+from fieldpose.stages.geometry import Similarity, nearest_point_to_axes, points_at_depth
+from fieldpose.stages.geometry.arrays import Points64, Vector
+from fieldpose.stages.nerf.framing import METRE, OWN_UNIT, SOLID, reframed, shown_at
+from fieldpose.stages.nerf.metadata import FieldMetadata, Frame
+from fieldpose.stages.nerf.rendering_api import RayRenderer
+
+PLANE = "plane"
+"""In place of a direction or a point: that of what the object stands on."""
+_VIEWS, _LONGER_SIDE = 32, 160
+_CELLS = 48
+"""In the radius of the field's space; each that surface passes through counts as one point, however near it is seen."""
+
+
+class Framing:
+    """Turns, moves and scales a field, one after the other; what is said of it is said in the frame that it had."""
+
+    def __init__(self, renderer: RayRenderer, metadata: FieldMetadata) -> None:
+        self._renderer, self.metadata = renderer, metadata
+        self._given = metadata
+        self._change = Similarity.identity()
+        self._plane: tuple[Vector, float] | None = None
+
+    def point(self, spot: str) -> Vector:
+        """A point (3,) in the frame as it was: "X,Y,Z", or "IMAGE:X,Y", what a training view shows at a pixel there.
+
+        Raises UsageError, DatasetError and ConfigError.
+        """
+        name, colon, pixel = spot.rpartition(":")
+        if not colon:
+            return np.array(numbers(spot, 3, "a point X,Y,Z, or IMAGE:X,Y"))
+        x, y = numbers(pixel, 2, "a pixel X,Y after the image's name")
+        return shown_at(self._renderer, self._given, name, x, y)
+
+    def turn(self, up: str) -> None:
+        """z becomes `up`, "X,Y,Z" or PLANE; x stays as near to where it was as it can."""
+        if up == PLANE:
+            normal = self.plane()[0]
+        else:
+            normal = np.array(numbers(up, 3, f"a direction X,Y,Z, or {PLANE}"))
+            if not np.linalg.norm(normal) > 0:
+                raise UsageError(f"--up {up}: is no direction; one of X, Y, Z must not be 0")
+            normal = normal / np.linalg.norm(normal)
+        self._then(Similarity(1.0, _upright(self._change.rotation @ normal), np.zeros(3)))
+
+    def move(self, origin: str) -> None:
+        """The origin becomes a point, or with PLANE the one on it under what the cameras look at."""
+        if origin == PLANE:
+            normal, offset = self.plane()
+            focus = nearest_point_to_axes([camera.pose for camera in self._given.cameras])
+            point = focus - (normal @ focus - offset) * normal
+        else:
+            point = self.point(origin)
+        self._then(Similarity(1.0, np.eye(3), -self._change.of_points(point[None])[0]))
+
+    def scale(self, factor: float) -> None:
+        """Lengths become so many times as large."""
+        self._then(Similarity(factor, np.eye(3), np.zeros(3)))
+        self._call(METRE if self.metadata.metres_per_unit == 1 else OWN_UNIT)
+
+    def measure(self, first: str, second: str, metres: float) -> float:
+        """Between two points are so many metres, in which lengths are from now on; returns the distance as it was."""
+        apart = float(np.linalg.norm(self.point(first) - self.point(second)))
+        if not apart > 0:
+            raise UsageError(f"{first} and {second} are the same point; give two that are apart")
+        self.scale(metres / apart)
+        self.metadata = msgspec.structs.replace(self.metadata, metres_per_unit=1.0, unit=METRE)
+        return apart
+
+    def say_metres(self, metres_per_unit: float) -> None:
+        """The unit is known to be so long; no number changes."""
+        self.metadata = msgspec.structs.replace(self.metadata, metres_per_unit=metres_per_unit)
+        self._call(METRE if metres_per_unit == 1 else self.metadata.unit)
+
+    def back(self) -> None:
+        """The dataset's own frame and unit again."""
+        self._then(self.metadata.frame.object_from_dataset.inverse())
+        self._call(self.metadata.frame.unit or self.metadata.unit)
+        self.metadata = msgspec.structs.replace(self.metadata, frame=Frame())
+
+    def plane(self) -> tuple[Vector, float]:
+        """Normal n and offset d, n @ x = d, of what the object stands on, in the frame as it was. ConfigError."""
+        from fieldpose.stages.structure.upright import plane_under
+
+        if self._plane is None:
+            poses = np.stack([camera.pose for camera in self._given.cameras])
+            self._plane = plane_under(poses, surface_of(self._renderer, self._given))
+        if self._plane is None:
+            raise ConfigError(
+                "no plane was found under the object that most of what is around it lies on; give --up X,Y,Z and"
+                " --origin IMAGE:X,Y instead"
+            )
+        return self._plane
+
+    def _call(self, unit: str) -> None:
+        self.metadata = msgspec.structs.replace(self.metadata, unit=unit)
+
+    def _then(self, change: Similarity) -> None:
+        self.metadata = reframed(self.metadata, change)
+        self._change = change.after(self._change)
+
+
+def surface_of(renderer: RayRenderer, metadata: FieldMetadata) -> Points64:
+    """Points (n, 3) of a field's surface, evenly spread, where its training views look."""
+    cameras, found = metadata.cameras, [np.empty((0, 3))]
+    for view in cameras[:: -(-len(cameras) // _VIEWS) or 1]:
+        seen = renderer.render_view(view.camera.undistorted().shrunk(_LONGER_SIDE), view.pose)
+        solid = (seen.opacity >= SOLID).ravel()
+        pixels, depth = seen.camera.grid()[solid], seen.depth.ravel()[solid]
+        found.append(points_at_depth(seen.camera, view.pose, pixels, depth))
+    points = np.concatenate(found)
+    _, one_each = np.unique(np.floor(points / (metadata.space.scale / _CELLS)), axis=0, return_index=True)
+    return np.asarray(points[one_each], np.float64)
+
+
+def numbers(text: str, count: int, expected: str) -> list[float]:
+    """So many finite numbers between commas. UsageError, with what was expected."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not np.isfinite(values).all():
+        raise UsageError(f"{text!r}: expected {expected}")
+    return values
+
+
+def _upright(up: Vector) -> np.ndarray:
+    """Rotation (3, 3) whose rows are the new axes: z is `up`, x near the old one."""
+    old = np.eye(3)[0 if abs(up[0]) < 0.9 else 1]
+    x = old - (old @ up) * up
+    x = x / np.linalg.norm(x)
+    return np.stack([x, np.cross(up, x), up])

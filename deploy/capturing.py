@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from fieldpose.deploy.reporting.boxes import boxed, sheet
 from fieldpose.deploy.reporting.output import write_bytes, write_json
+from fieldpose.deploy.reporting.overlay import encoded
 from fieldpose.deploy.shots import FILMED_S, Report, Shot, Shots, read_shots
 from fieldpose.errors import DatasetError, GeometryError
 from fieldpose.stages.cores import usable_cores
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 
 IMAGES = "images"
 CAMERA_FILE = "camera.json"
+OBJECT_PICTURE = "object.jpg"
+_PICTURES = 6
 HELD_OUT_EVERY = 10
 """One in so many images is not learnt from, and tells how good the field is."""
 FEWEST = 8
@@ -49,6 +53,7 @@ class Captured:
     """A dataset that was made, in figures; `reasons` of the images without a place: name -> why.
 
     on_plane: whether up is that of a plane. marker: the one that gave frame and unit, and how many images show it.
+    object_aabb: lowest and highest corner of a box around what the cameras look at, None where nothing stands apart.
     """
 
     images: int
@@ -61,6 +66,7 @@ class Captured:
     on_plane: bool
     metres_per_unit: float | None
     marker: tuple[int, int] | None = None
+    object_aabb: tuple[tuple[float, ...], ...] | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -282,6 +288,7 @@ class Structure:
 def _write(
     out: Path, shots: Shots, mapped: Mapped, structure: Structure, marker: Marker | None, report: Report
 ) -> Captured:
+    from fieldpose.stages.structure.box import object_box
     from fieldpose.stages.structure.upright import stand
 
     standing = stand(mapped.cam_from_object, mapped.points)
@@ -295,12 +302,18 @@ def _write(
     for i, shot in enumerate(chosen):
         write_bytes(out / IMAGES / shot.name, shot.jpeg)
         report("writing the images", (i + 1) / len(chosen))
+    box = object_box(object_from_map.of_points(mapped.points), poses)
+    if box is not None:
+        shown = np.linspace(0, len(chosen) - 1, min(_PICTURES, len(chosen))).astype(int)
+        pictures = [boxed(chosen[i].image(), cameras[i], poses[i], box) for i in shown]
+        write_bytes(out / OBJECT_PICTURE, encoded(sheet(pictures), out / OBJECT_PICTURE))
     write_json(out / CAMERA_FILE, cameras[0])
-    write_json(out / FILE, transforms_document(names, cameras, poses, held_out, metres))
+    write_json(out / FILE, transforms_document(names, cameras, poses, held_out, metres, box))
     return Captured(
         len(chosen), len(shots.chosen), len(shots.blurred), shots.seen, structure.why_not(mapped), cameras[0],
         mapped.error_px * cameras[0].width / mapped.camera.width, standing.on_plane, metres,
-        None if marker is None else (marker.number, marker.images), structure.notes,
+        None if marker is None else (marker.number, marker.images),
+        None if box is None else tuple(map(tuple, box.tolist())), structure.notes,
     )  # fmt: skip
 
 

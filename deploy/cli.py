@@ -32,6 +32,7 @@ COMMANDS = {
     "edit": "a recorded sequence with a disturbance in it, to test how far tracking can be trusted",
     "recover": "save what can be saved of an unfinished or damaged recording",
     "frame": "turn, move and scale the frame that a field's poses are in",
+    "crop": "a field of the object alone, out of one of all that is around it",
     "evaluate": "how well poses are found on a dataset, method by method",
     "bench": "how fast the parts are on this machine",
     "doctor": "check this machine, the bus, the weights, a dataset",

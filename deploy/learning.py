@@ -16,7 +16,7 @@ from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 from fieldpose.stages.nerf.datasets import Dataset
 from fieldpose.stages.nerf.datasets.assemble import Holdout
 from fieldpose.stages.nerf.field import Field
-from fieldpose.stages.nerf.from_dataset import FittedCameras, TrainedField, TrainingReport, train_field
+from fieldpose.stages.nerf.from_dataset import FittedCameras, Only, TrainedField, TrainingReport, train_field
 from fieldpose.stages.nerf.metadata import DESCRIBED_SIZE, PoseAccuracy
 
 Say = Callable[[str], None]
@@ -35,21 +35,24 @@ def learn_field(
     cameras: Cameras = "auto",
     note: Say = lambda text: None,
     looked: Callable[[str, float], None] = lambda what, share: None,
+    only: Only | None = None,
 ) -> TrainedField:
     """Learn, save, describe and examine a field; see train_field.
 
     say: is told in a line where weights are missing, without which the field remembers nothing, or is not examined, and
     what of the dataset a user should know. cameras: whether those that do not fit their images are adjusted. note: is
     told that they fit, or how they were adjusted. looked: is told what is done before the training, and its share.
+    only: what of the dataset is learnt, where that is not all.
     Raises DatasetError, ConfigError.
     """
     matching = matching or MatchingConfig()
     return train_field(
         dataset, out, size, holdout, training, model, report,
-        lambda images: _described(images, matching, say),
+        lambda images: described(images, matching, say),
         lambda field, images: _examined(field, images, matching, training, say),
         say,
         lambda found: None if cameras == "given" else _fitted(found, holdout, training.threads, say, note, looked),
+        only,
     )  # fmt: skip
 
 
@@ -65,7 +68,7 @@ def _fitted(
     return fitted
 
 
-def _described(images: Iterable[np.ndarray], matching: MatchingConfig, say: Say) -> np.ndarray | None:
+def described(images: Iterable[np.ndarray], matching: MatchingConfig, say: Say) -> np.ndarray | None:
     """What the field remembers of its training views; None where the weights are missing."""
     # Torch takes 300 MB, of which the training has no need.
     from fieldpose.stages.retrieval.core import describer, remembered

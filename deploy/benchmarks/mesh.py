@@ -100,7 +100,8 @@ def _densities(field: Field, workers: Workers, u: np.ndarray) -> np.ndarray:
 def _occupied(field: Field, u: np.ndarray) -> np.ndarray:
     n = len(field.occupied)
     x, y, z = np.moveaxis(np.clip((u * n).astype(np.int64), 0, n - 1), -1, 0)
-    inside = (np.abs(2 * u - 1) <= field.metadata.space.half).all(axis=-1)
+    low, high = np.array(field.metadata.space.corners)
+    inside = ((low <= 2 * u - 1) & (2 * u - 1 <= high)).all(axis=-1)
     occupied: np.ndarray = field.occupied[z, y, x] & inside
     return occupied
 

@@ -12,7 +12,7 @@ from typing import Literal
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from fieldpose.deploy.capturing import ENOUGH, FEWEST, Captured, Square, advice, capture, summary
+from fieldpose.deploy.capturing import ENOUGH, FEWEST, OBJECT_PICTURE, Captured, Square, advice, capture, summary
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
 from fieldpose.deploy.shots import FILMED_S
 from fieldpose.errors import OutputError, UsageError
@@ -30,9 +30,11 @@ class Options:
     under what the cameras look at, and the unit, which no image tells, the median distance of the cameras from there;
     with a marker of known size in view (--marker) frame and unit are the marker's.
     The dataset has images/, transforms.json, in which one image in ten is held out, and camera.json, the camera that
-    was found, for `run` (--camera.camera-file). Photographs are turned as their EXIF says. The JSON file has: seen,
-    chosen, blurred, images (with a camera), reasons (image -> why it has none), camera, error_px, on_plane (whether up
-    is a plane's), metres_per_unit (null: not known), marker (its number, how many images show it), notes, seconds.
+    was found, for `run` (--camera.camera-file). What stands apart in the midst of the cameras gets a box, object_aabb
+    in transforms.json, which may be edited there; object.jpg shows it. Photographs are turned as their EXIF says. The
+    JSON file has: seen, chosen, blurred, images (with a camera), reasons (image -> why it has none), camera, error_px,
+    on_plane (whether up is a plane's), metres_per_unit (null: not known), marker (its number, how many images show it),
+    object_aabb (null: none was found), notes, seconds.
     """
 
     source: tyro.conf.Positional[str]
@@ -91,6 +93,8 @@ def _in_words(captured: Captured, out: Path, seconds: float) -> Iterator[str]:
     up = "what the object stands on" if captured.on_plane else "the cameras (no plane was found under the object)"
     if captured.marker is None:
         yield f"up is that of {up}; lengths are in the median distance of the cameras from what they look at"
+    if captured.object_aabb is not None:
+        yield f"a box was put around the object ({out / OBJECT_PICTURE} shows it); `train --only box` learns it alone"
     if captured.reasons:
         few = captured.images < ENOUGH * captured.chosen
         yield (

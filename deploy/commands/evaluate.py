@@ -179,7 +179,7 @@ class Options:
 
         if self.surface is not None:
             return read_surface(self.surface)
-        if field.metadata.space.contracted:
+        if field.metadata.space.corners is None:
             return None
         return surface_of(renderer, field.metadata.cameras, np.random.default_rng(0))
 

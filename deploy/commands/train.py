@@ -63,6 +63,10 @@ class Options:
     """auto: where the images' own matches show that poses, focal length or distortion are off by more than is seen,
     they are adjusted before the training, in the dataset's frame and unit; else they are kept as they are. given: they
     are taken as they are, without looking."""
+    only: Literal["box", "masks"] | None = None
+    """Learn an object alone, so that it is found wherever it is moved. box: what is in the dataset's object_aabb, which
+    `capture` puts around what the cameras look at. masks: what the images' masks show. Without this option what masks
+    leave out is not learnt, and everything else is."""
     turntable: str | None = None
     """Write a video (.mp4) of what was learnt, three seconds around the object or along training views, into this file;
     by default beside the field, under its name. none: write none."""
@@ -87,7 +91,7 @@ class Options:
         with _progress_bar() as (report, looked):
             trained = learn_field(
                 self.dataset, self.out, self.size, holdout, training, self.model, self.matching, report, _say,
-                self.cameras, _say, looked,
+                self.cameras, _say, looked, self.only,
             )  # fmt: skip
         figures = _figures(trained, self.out)
         write_json(self.json, figures)

@@ -58,9 +58,11 @@ def domain_of(space: Space, occupied: np.ndarray) -> Domain:
     from fieldpose.stages.nerf.occupancy import pack
 
     bits, distance = pack(occupied)
-    half = np.array(space.half, np.float32)
+    corners = space.corners
+    low, high = np.zeros((2, 3), np.float32) if corners is None else corners.astype(np.float32)
     return Domain(
-        space.contracted, half, space.step, space.near, space.far, bits, distance, occupied.shape[0]
+        space.contracted, corners is not None, low, high, space.step, space.near, space.far, bits, distance,
+        occupied.shape[0],
     )  # fmt: skip
 
 

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
 
-from fieldpose.errors import DatasetError
+from fieldpose.errors import ConfigError, DatasetError
 from fieldpose.stages.nerf.backend import resolved
 from fieldpose.stages.nerf.blocks import View
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
+from fieldpose.stages.nerf.cropping import box_within, cropped, in_words
 from fieldpose.stages.nerf.datasets import Dataset, PosedCamera, load_dataset
 from fieldpose.stages.nerf.datasets.images import over_background
 from fieldpose.stages.nerf.field import Field
@@ -27,6 +28,7 @@ from fieldpose.stages.nerf.training import Learner, Progress, Trainer, evaluate
 if TYPE_CHECKING:
     from fieldpose.stages.nerf.datasets.assemble import Holdout
 
+Only = Literal["box", "masks"]
 GREY = (0.5, 0.5, 0.5)
 """Behind a field of all that the images show, where a ray ends in nothing."""
 BOUNDED_STEP, CONTRACTED_STEP = 2 / 384, 1 / 128
@@ -140,6 +142,7 @@ def train_field(
     examine: Callable[[Field, Sequence[np.ndarray]], PoseAccuracy | None] = lambda field, images: None,
     say: Callable[[str], None] = lambda text: None,
     fit: Callable[[Dataset], FittedCameras | None] = lambda dataset: None,
+    only: Only | None = None,
 ) -> TrainedField:
     """Train on a dataset's training images, measure on its held-out ones, and save; Ctrl-C ends the training early.
 
@@ -149,10 +152,15 @@ def train_field(
     say: is told, a line each, what of the dataset a user should know.
     fit: is given the training images, finds out whether the dataset's cameras fit, and cameras of both splits that do
     where they do not.
+    only: an object alone, "box": what is in the dataset's object_aabb, of a field of all that the images show; "masks":
+    what their masks show, as if the rest were transparent.
     Raises DatasetError; nothing is written before the training is over.
     """
     training, config = training or TrainingConfig(), config or FieldConfig()
-    dataset = load_dataset(path, "train", size, holdout=holdout)
+    cut_out = only == "masks"
+    dataset = load_dataset(path, "train", size, holdout=holdout, cut_out=cut_out)
+    box = _box_of(dataset) if only == "box" else None
+    say(_what(dataset, box))
     for note in dataset.notes:
         say(note)
     if len(dataset) < FEW:
@@ -160,14 +168,14 @@ def train_field(
     fitted = fit(dataset)
     cameras = None if fitted is None else fitted.cameras
     if cameras is not None:
-        dataset = load_dataset(path, "train", size, holdout=holdout, cameras=cameras)
+        dataset = load_dataset(path, "train", size, holdout=holdout, cameras=cameras, cut_out=cut_out)
     views = views_of(dataset)
     if all(view.learnt is not None and not view.learnt.any() for view in views):
         raise DatasetError(f"{path}: the masks (mask_path) leave nothing to learn from; white is what counts")
     masked = sum(view.learnt is not None for view in views)
     if masked:
         say(f"{masked} of {len(views)} training images have masks: what these leave out is not learnt")
-    held_out = held_out_views(path, size, holdout, cameras)
+    held_out = held_out_views(path, size, holdout, cameras, cut_out)
     metadata = replace_metadata(metadata_of(dataset, views, config), camera_fit=None if fitted is None else fitted.fit)
     trainer = make_learner(views, metadata.space, config, training)
     monitor = _Monitor(trainer, metadata, held_out[: training.validation_views], report)
@@ -185,15 +193,60 @@ def train_field(
     # Saved after each step, since what comes next takes a while and may be ended by Ctrl-C.
     field.save(out)
     images = [over_background(view.image, dataset.background) for view in views]
-    field.descriptors = remember(images)
-    field.save(out)
     scores = evaluate(NumbaRenderer(field, training.threads), held_out) if held_out and not interrupted else []
+    if box is not None:
+        field = _cut(field, box, out)
+    # Of what was learnt alone, images show much else beside it.
+    field.descriptors = remember(images if box is None else own_views(field, training.threads))
+    field.save(out)
     if scores:
         field.metadata = replace_metadata(field.metadata, psnr_db=float(np.mean(scores)))
     if not interrupted:
         field.metadata = replace_metadata(field.metadata, accuracy=examine(field, images))
     field.save(out)
     return TrainedField(field, scores, interrupted)
+
+
+def own_views(field: Field, threads: int) -> Iterator[np.ndarray]:
+    """What a field shows of itself to its training views, images (h, w, 3) uint8."""
+    renderer = NumbaRenderer(field, threads)
+    try:
+        for view in field.metadata.cameras:
+            yield renderer.render_view(view.camera.undistorted(), view.pose).rgb
+    finally:
+        renderer.close()
+
+
+def _box_of(dataset: Dataset) -> np.ndarray:
+    box = dataset.object_aabb
+    if box is None:
+        raise DatasetError(
+            f"{dataset.root}: names no box to learn alone; write one as object_aabb into transforms.json, [[lowest x,"
+            " y, z], [highest x, y, z]], or train without, and then use `fieldpose crop`"
+        )
+    try:
+        box_within(space_of(dataset), box)
+    except ConfigError as error:
+        raise DatasetError(f"{dataset.root}: {error}") from error
+    return box
+
+
+def _cut(field: Field, box: np.ndarray, out: Path) -> Field:
+    try:
+        return cropped(field, box)
+    except ConfigError as error:
+        raise DatasetError(f"{error}; {out} holds the whole scene") from error
+
+
+def _what(dataset: Dataset, box: np.ndarray | None) -> str:
+    if box is not None:
+        return f"learning an object alone: what is in the box {in_words(box)}; the rest is learnt first, then left out"
+    if dataset.cut_out:
+        return "learning an object alone: what the masks show"
+    if dataset.scene == "object":
+        shown = "what the images do not leave transparent" if dataset.has_alpha else "what is before a plain background"
+        return f"learning an object alone: {shown}"
+    return "learning the scene: all that the images show, which is not to move against each other later"
 
 
 def finished(learner: Learner, metadata: FieldMetadata, views: Sequence[View]) -> Field:
@@ -236,12 +289,13 @@ def replace_metadata(metadata: FieldMetadata, **changes: object) -> FieldMetadat
 
 
 def held_out_views(
-    path: Path, size: int | None, holdout: Holdout | None, cameras: Sequence[PosedCamera] | None = None
-) -> list[View]:
-    """The held-out images of a dataset, loaded; none where nothing is held out. cameras: see load_dataset."""
+    path: Path, size: int | None, holdout: Holdout | None, cameras: Sequence[PosedCamera] | None = None,
+    cut_out: bool = False,
+) -> list[View]:  # fmt: skip
+    """The held-out images of a dataset, loaded; none where nothing is held out. cameras, cut_out: see load_dataset."""
     if holdout is None:
         return []
-    both = load_dataset(path, "all", size, holdout=holdout, cameras=cameras)
+    both = load_dataset(path, "all", size, holdout=holdout, cameras=cameras, cut_out=cut_out)
     test = tuple(record for record in both.images if record.split == "test")
     views = views_of(replace(both, images=test)) if test else []
     return [view for view in views if view.learnt is None or view.learnt.any()]

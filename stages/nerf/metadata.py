@@ -16,14 +16,16 @@ DESCRIBED_SIZE = 400
 
 Rows3 = tuple[float, float, float, float, float, float, float, float, float]
 """A 3x3 matrix by rows."""
+Corners = tuple[float, float, float, float, float, float]
+"""The lowest and the highest corner of a box: x y z x y z."""
 UNTURNED: Rows3 = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """From object coordinates to the field's: y = rotation (x - centre) / scale.
 
-    A bounded field fills the box |y| <= half; a contracted one all space, the unit ball at full resolution.
-    `near`, `far` and `step` are lengths in y.
+    A bounded field fills the box |y| <= half; a contracted one all space, the unit ball at full resolution; either one
+    only `box`, its lowest and its highest corner, where that is given. `near`, `far` and `step` are lengths in y.
     """
 
     contracted: bool
@@ -34,6 +36,17 @@ class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     far: float = 8.0
     step: float = 2.0 / 384
     rotation: Rows3 = UNTURNED
+    box: Corners | None = None
+
+    @property
+    def corners(self) -> np.ndarray | None:
+        """The box (2, 3) float64 in y that everything is in; None where there is none."""
+        if self.box is not None:
+            return np.reshape(np.array(self.box, np.float64), (2, 3))
+        if self.contracted:
+            return None
+        half = np.array(self.half, np.float64)
+        return np.stack([-half, half])
 
     @property
     def turn(self) -> np.ndarray:

@@ -35,7 +35,7 @@ class NumbaRenderer:
         self.samples_evaluated = 0
         self._net, self._domain = _packed(field.net), field.domain()
         self._background = np.array(field.metadata.background, np.float32)
-        self._centres = None if self._domain.contracted else block_centres(self._domain)
+        self._centres = block_centres(self._domain) if self._domain.boxed else None
         self._workers = Workers(field.metadata.config, threads, PACKET, PACKET * PER_RAY, backward=False)
         self._jacobian_workers: Workers | None = None
 

@@ -36,7 +36,7 @@ class Tour:
 
 
 def tour(metadata: FieldMetadata, frames: int, longer_side: int) -> Tour:
-    """A full circle where the training views surround what is bounded, at their median height and distance.
+    """A full circle where the training views surround what is in a box, at their median height and distance.
 
     Else to and fro along training views, from one end of them to the other. frames: an even number. The field must tell
     of training views.
@@ -44,7 +44,7 @@ def tour(metadata: FieldMetadata, frames: int, longer_side: int) -> Tour:
     chosen = np.unique(np.linspace(0, len(metadata.cameras) - 1, min(_MOST_VIEWS, len(metadata.cameras))).astype(int))
     poses = np.array([metadata.cameras[i].pose for i in chosen])
     camera = _even(metadata.cameras[0].camera.undistorted().shrunk(longer_side))
-    if not metadata.space.contracted and _gap(poses) < _LARGEST_GAP:
+    if metadata.space.corners is not None and _gap(poses) < _LARGEST_GAP:
         return Tour(camera, _circle(poses, frames), list(range(frames)))
     there = list(range(frames // 2 + 1))
     return Tour(camera, _along(poses, len(there)), there + there[-2:0:-1])

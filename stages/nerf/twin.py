@@ -125,13 +125,14 @@ class TwinField(nn.Module):
     def _clip(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
         near = torch.full_like(origins[:, 0], self.space.near)
         far = torch.full_like(near, self.space.far)
-        if self.space.contracted:
+        corners = self.space.corners
+        if corners is None:
             return near, far
-        half = torch.tensor(self.space.half, dtype=origins.dtype, device=origins.device)
+        lowest, highest = torch.tensor(corners, dtype=origins.dtype, device=origins.device)
         parallel = directions.abs() < 1e-9
         safe = torch.where(parallel, torch.ones_like(directions), directions)
-        first, second = (-half - origins) / safe, (half - origins) / safe
-        inside = origins.abs() <= half
+        first, second = (lowest - origins) / safe, (highest - origins) / safe
+        inside = (lowest <= origins) & (origins <= highest)
         infinite = torch.full_like(first, 1e9)
         low = torch.where(parallel, torch.where(inside, -infinite, infinite), torch.minimum(first, second))
         high = torch.where(parallel, torch.where(inside, infinite, -infinite), torch.maximum(first, second))

@@ -52,17 +52,20 @@ def with_cameras(draft: Draft, cameras: Sequence[PosedCamera]) -> Draft:
     return replace(draft, records=records)
 
 
-def assemble(root: Path, draft: Draft, split: Split) -> Dataset:
+def assemble(root: Path, draft: Draft, split: Split, cut_out: bool = False) -> Dataset:
     """The Dataset of one split; what it says of the scene depends on the training images alone.
 
-    DatasetError if the split is empty or some images have an alpha channel and others none.
+    DatasetError if the split is empty, some images have an alpha channel and others none, or one has no mask that is to
+    be cut out by it.
     """
     chosen = tuple(record for record in draft.records if split in ("all", record.split))
     if not chosen:
         raise DatasetError(f"{root}: the {split} split is empty; choose another split or holdout, or add images")
     train = [record for record in draft.records if record.split == "train"] or draft.records
     _check_near(root, train)
-    transparent = _is_transparent(draft.records)
+    if cut_out:
+        _check_masks(root, draft.records)
+    transparent = cut_out or _is_transparent(draft.records)
     background = images.WHITE if transparent else images.plain_background([partial(_shown, r) for r in train])
     scene: Scene = "object" if background else "unbounded" if draft.aabb is None else "bounded"
     return Dataset(
@@ -74,11 +77,21 @@ def assemble(root: Path, draft: Draft, split: Split) -> Dataset:
         bounds=_bounds(scene, draft, train),
         unit=draft.unit,
         has_alpha=transparent,
+        cut_out=cut_out,
         scale=draft.scale,
         metres_per_unit=draft.metres_per_unit,
         object_aabb=None if draft.object_aabb is None else np.array(draft.object_aabb, dtype=np.float64),
         notes=draft.notes + (_plain_note(background) if background and not transparent else ()),
     )
+
+
+def _check_masks(root: Path, records: Sequence[ImageRecord]) -> None:
+    without = [record.name for record in records if record.learnt_path is None]
+    if without:
+        raise DatasetError(
+            f"{root}: {len(without)} of {len(records)} images have no mask to cut the object out by (the first is"
+            f" {without[0]}); give each one: mask_path in transforms.json, or a masks folder"
+        )
 
 
 def _check_near(root: Path, records: Sequence[ImageRecord]) -> None:

@@ -20,6 +20,7 @@ def load_dataset(
     holdout: Holdout | None = "auto",
     llff_normalise: bool = True,
     cameras: Sequence[PosedCamera] | None = None,
+    cut_out: bool = False,
 ) -> Dataset:
     """Read a dataset's poses and cameras, and make sure that its files are there; pixels are read later.
 
@@ -27,13 +28,14 @@ def load_dataset(
     downscale: shrink by this factor instead; LLFF takes the folder of that factor. holdout, for kinds without
     splits of their own: "odd" or "every8" images (sorted by name) are test, None holds nothing out, "auto" is "odd"
     for transforms.json and "every8" for LLFF and COLMAP. llff_normalise: see llff.read_llff. cameras: of all images,
-    both splits, in their order, instead of those that the files tell.
+    both splits, in their order, instead of those that the files tell. cut_out: what masks leave out is not there, as
+    what is transparent is not, instead of not known.
     Raises DatasetError, one line that names the file and says how to mend it.
     """
     root = Path(path)
     _check_options(root, size, downscale)
     draft = _read(root, holdout, llff_normalise, downscale, size)
-    dataset = assemble(root, draft if cameras is None else with_cameras(draft, cameras), split)
+    dataset = assemble(root, draft if cameras is None else with_cameras(draft, cameras), split, cut_out)
     if size is not None:
         return dataset.resized(size)
     if downscale is not None and dataset.kind != "llff":

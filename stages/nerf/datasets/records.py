@@ -56,10 +56,10 @@ class PosedCamera:
 class Dataset:
     """Posed photographs of one scene; methods may be called from several threads at once.
 
-    scene: "object" (cut out by the images' alpha channel, if has_alpha, else on a plain background), "bounded" (all
-    inside bounds.aabb) or "unbounded". background: what is behind an object, or is to be laid behind it. scale: object
-    units per unit of the dataset's own files. object_aabb: (2, 3), where the dataset names one object in its scene.
-    notes: what a user should be told, one line each.
+    scene: "object" (cut out by the images' alpha channel, if has_alpha, which is their masks, if cut_out; else on a
+    plain background), "bounded" (all inside bounds.aabb) or "unbounded". background: what is behind an object, or is to
+    be laid behind it. scale: object units per unit of the dataset's own files. object_aabb: (2, 3), where the dataset
+    names one object in its scene. notes: what a user should be told, one line each.
     """
 
     root: Path
@@ -70,6 +70,7 @@ class Dataset:
     bounds: SceneBounds
     unit: str
     has_alpha: bool = False
+    cut_out: bool = False
     scale: float = 1.0
     metres_per_unit: float | None = None
     object_aabb: np.ndarray | None = None
@@ -81,7 +82,12 @@ class Dataset:
     def load_image(self, index: int) -> np.ndarray:
         """Image (h, w, 3 or 4) uint8 RGB(A) at its camera's size. DatasetError if the file cannot be decoded."""
         record = self.images[index]
-        return images.load_pixels(record.path, record.camera.width, record.camera.height, self.has_alpha)
+        width, height = record.camera.width, record.camera.height
+        if self.cut_out and record.learnt_path is not None:
+            pixels = images.load_pixels(record.path, width, height, alpha=False)
+            mask = images.load_mask(record.learnt_path, width, height)
+            return np.dstack([pixels, np.where(mask, 255, 0).astype(np.uint8)])
+        return images.load_pixels(record.path, width, height, self.has_alpha)
 
     def load_rgb(self, index: int) -> np.ndarray:
         """Image (h, w, 3) uint8 as a camera would see it: laid over the background where it has alpha."""
@@ -115,7 +121,7 @@ class Dataset:
     def load_learnt(self, index: int) -> np.ndarray | None:
         """Pixels (h, w) bool of an image that are to be learnt from; None for all. DatasetError."""
         record = self.images[index]
-        if record.learnt_path is None:
+        if record.learnt_path is None or self.cut_out:
             return None
         return images.load_mask(record.learnt_path, record.camera.width, record.camera.height)
 

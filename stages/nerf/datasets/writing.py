@@ -19,10 +19,12 @@ def transforms_document(
     cam_from_object: np.ndarray,
     held_out: Collection[str] = (),
     metres_per_unit: float | None = None,
+    object_aabb: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """What transforms.json says of images by their paths in the dataset, one camera and pose (n, 4, 4) an image.
 
     Intrinsics stand once where all images share them, else with each image. held_out: the images of the test split.
+    object_aabb: (2, 3), the lowest and the highest corner of a box around one object.
     """
     shared = len(set(cameras)) == 1
     frames: list[dict[str, Any]] = []
@@ -34,6 +36,8 @@ def transforms_document(
     document["camera_model"] = "OPENCV"
     if metres_per_unit is not None:
         document["metres_per_unit"] = metres_per_unit
+    if object_aabb is not None:
+        document["object_aabb"] = object_aabb.tolist()
     if held_out:
         document["train_filenames"] = [name for name in names if name not in held_out]
         document["test_filenames"] = [name for name in names if name in held_out]

@@ -16,15 +16,23 @@ NEVER = np.float32(np.inf)
 
 
 def block_centres(dom: Domain) -> np.ndarray:
-    """Centres (n, 3) float32 of the blocks with an occupied cell, in normalised coordinates; uncontracted space."""
+    """Centres (n, 3) float32 of the blocks with an occupied cell, in normalised coordinates; space in a box.
+
+    That of a contracted one is in the unit ball, where a cube is a cube.
+    """
     blocks = dom.resolution // BLOCK
     z, y, x = np.nonzero(dom.distance.reshape(blocks, blocks, blocks) == 0)
-    return ((np.stack([x, y, z], axis=1) + 0.5) * (2 / blocks) - 1).astype(np.float32)
+    half = _half_of_cube(dom)
+    return ((np.stack([x, y, z], axis=1) + 0.5) * (2 * half / blocks) - half).astype(np.float32)
 
 
 def block_radius(dom: Domain) -> float:
     """Of the ball around a block, with what rounding may put beside it."""
-    return 1.001 * math.sqrt(3) * BLOCK / dom.resolution
+    return 1.001 * math.sqrt(3) * BLOCK / dom.resolution * _half_of_cube(dom)
+
+
+def _half_of_cube(dom: Domain) -> float:
+    return 2.0 if dom.contracted else 1.0
 
 
 @njit(inline="always")

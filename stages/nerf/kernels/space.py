@@ -69,15 +69,15 @@ def occupied(dom: Domain, u0: float, u1: float, u2: float) -> int:
 def clip(dom: Domain, o: np.ndarray, d: np.ndarray) -> tuple[float, float]:
     """Where a ray with unit direction enters and leaves the domain; empty where the second is not larger."""
     near, far = np.float32(dom.near), np.float32(dom.far)
-    if not dom.contracted:
+    if dom.boxed:
         for a in range(3):
             if abs(d[a]) < np.float32(1e-9):
-                if abs(o[a]) > dom.half[a]:
+                if o[a] < dom.low[a] or o[a] > dom.high[a]:
                     far = near
             else:
                 inverse = np.float32(1) / d[a]
-                t0 = (-dom.half[a] - o[a]) * inverse
-                t1 = (dom.half[a] - o[a]) * inverse
+                t0 = (dom.low[a] - o[a]) * inverse
+                t1 = (dom.high[a] - o[a]) * inverse
                 near = max(near, min(t0, t1))
                 far = min(far, max(t0, t1))
     return near, far

@@ -29,7 +29,9 @@ class Domain(NamedTuple):
     """Where the field lives, in normalised coordinates, and what of it is occupied."""
 
     contracted: bool
-    half: np.ndarray  # (3,) half extents of the box that rays are clipped to, where not contracted
+    boxed: bool  # whether rays are clipped to a box; always where not contracted
+    low: np.ndarray  # (3,) its lowest corner
+    high: np.ndarray  # (3,) its highest corner
     step: float  # step length, before the growth with distance of contracted space
     near: float
     far: float

@@ -11,6 +11,7 @@ import numpy as np
 
 from fieldpose.errors import ConfigError
 from fieldpose.stages.nerf.metadata import FieldMetadata, Space
+from fieldpose.stages.nerf.normalise import object_points
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 from fieldpose.stages.nerf.surface.fusion import fused, grid_over
 from fieldpose.stages.nerf.surface.kernels import DepthViews
@@ -53,12 +54,14 @@ class Region:
 
 
 def region_of(space: Space) -> Region:
-    """The box of a bounded field, or the one around it where it is turned; of a contracted one the ball that it has at
-    full resolution."""
-    middle, half = np.array(space.centre), np.array(space.half) * space.scale
-    if not space.contracted:
-        half = np.abs(space.turn.T) @ half
-    return Region(np.stack([middle - half, middle + half]), ball=space.contracted, exact=space.contracted)
+    """The box that a field is in, or the one around it where it is turned; else the ball that it has at full
+    resolution."""
+    corners, middle = space.corners, np.array(space.centre)
+    if corners is None:
+        return Region(np.stack([middle - space.scale, middle + space.scale]), ball=True)
+    middle = object_points(space, corners.mean(axis=0))
+    half = np.abs(space.turn.T) @ (corners[1] - corners[0]) / 2 * space.scale
+    return Region(np.stack([middle - half, middle + half]), exact=False)
 
 
 def seen_surface(renderer: RayRenderer, metadata: FieldMetadata) -> DepthViews:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import msgspec
@@ -24,6 +25,7 @@ from fieldpose.stages.nerf.torch_renderer import TorchRenderer
 SPACES = {
     "box": Space(False, (0.1, -0.2, 0.3), 1.5, half=(1.0, 0.8, 0.9), step=0.03),
     "ball": Space(True, (0.1, -0.2, 0.3), 1.5, near=0.05, far=20.0, step=0.06),
+    "part": Space(True, (0.1, -0.2, 0.3), 3.0, near=0.05, far=20.0, step=0.03, box=(-0.5, -0.5, -0.4, 0.6, 0.2, 0.6)),
 }
 CONFIG = FieldConfig(
     levels=3, log2_table=9, finest_resolution=64, hidden=16, features=6, colour_hidden=8, occupancy_resolution=16
@@ -94,10 +96,12 @@ def test_coordinates_lead_there_and_back(space: str) -> None:
     )
 
 
-def test_a_turned_box_lies_in_its_region() -> None:
-    space = SPACES["box"]
+@pytest.mark.parametrize("name", ["box", "part"])
+def test_a_turned_box_lies_in_its_region(name: str) -> None:
+    space = SPACES[name]
     moved = reframed(field_in(space).metadata, MOVED).space
-    corners = np.array(np.meshgrid(*[(-h, h) for h in space.half])).reshape(3, -1).T
+    assert space.corners is not None
+    corners = np.array(list(itertools.product(*space.corners.T)))
     there = object_points(moved, corners)
     box = region_of(moved).box
     np.testing.assert_allclose(box, np.stack([there.min(axis=0), there.max(axis=0)]), atol=1e-12)

@@ -20,6 +20,7 @@ from fieldpose.stages.nerf.workers import Workers
 
 BOX = Space(False, (0.1, -0.2, 0.3), 1.5, half=(1.0, 0.8, 0.9), step=0.03)
 BALL = Space(True, (0.1, -0.2, 0.3), 1.5, near=0.05, far=20.0, step=0.06)
+PART = Space(True, (0.1, -0.2, 0.3), 3.0, near=0.05, far=20.0, step=0.03, box=(-0.5, -0.5, -0.4, 0.6, 0.2, 0.6))
 CONFIGS = {
     "wide": FieldConfig(
         levels=3, log2_table=9, finest_resolution=64, hidden=16, features=6, colour_hidden=8, occupancy_resolution=16
@@ -52,7 +53,7 @@ def random_rays(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 @settings(max_examples=12, deadline=None)
 @given(
-    config=st.sampled_from(sorted(CONFIGS)), space=st.sampled_from([BOX, BALL]),
+    config=st.sampled_from(sorted(CONFIGS)), space=st.sampled_from([BOX, BALL, PART]),
     fill=st.sampled_from([0.0, 0.02, 0.3, 1.0]), seed=st.integers(0, 1000),
 )  # fmt: skip
 def test_renders_as_the_twin(config: str, space: Space, fill: float, seed: int) -> None:
@@ -66,7 +67,7 @@ def test_renders_as_the_twin(config: str, space: Space, fill: float, seed: int) 
     agree(fast.depth[solid], slow.depth[solid], 5e-3)
 
 
-@pytest.mark.parametrize("space", [BOX, BALL])
+@pytest.mark.parametrize("space", [BOX, BALL, PART])
 def test_a_view_is_the_twins(space: Space) -> None:
     """Tiles are cut off at the border of this image; in a box only what is met is traced."""
     field = random_field(CONFIGS["wide"], space, 0.3, 5)
@@ -91,7 +92,7 @@ def agree(a: np.ndarray, b: np.ndarray, tolerance: float) -> None:
     assert np.sum(error > tolerance) <= 0.06 * len(a), np.sort(error)[-8:]
 
 
-@pytest.mark.parametrize("space", [BOX, BALL])
+@pytest.mark.parametrize("space", [BOX, BALL, PART])
 def test_early_stop_costs_no_more_than_its_limit(space: Space) -> None:
     field = random_field(CONFIGS["wide"], space, 0.5, 3)
     origins, directions = random_rays(64, 3)
@@ -100,7 +101,7 @@ def test_early_stop_costs_no_more_than_its_limit(space: Space) -> None:
     assert np.abs(full.opacity - stopped.opacity).max() <= STOP_BELOW + 1e-4
 
 
-@pytest.mark.parametrize("space", [BOX, BALL])
+@pytest.mark.parametrize("space", [BOX, BALL, PART])
 @pytest.mark.parametrize("name", sorted(CONFIGS))
 def test_jacobian_as_the_twin(space: Space, name: str) -> None:
     field = random_field(CONFIGS[name], space, 0.4, 5)
@@ -114,7 +115,7 @@ def test_jacobian_as_the_twin(space: Space, name: str) -> None:
     assert np.corrcoef(by_fast.ravel(), by_slow.ravel())[0, 1] > 0.98
 
 
-@pytest.mark.parametrize("space", [BOX, BALL])
+@pytest.mark.parametrize("space", [BOX, BALL, PART])
 @pytest.mark.parametrize("name", sorted(CONFIGS))
 def test_training_gradients_as_the_twin(space: Space, name: str) -> None:
     field = random_field(CONFIGS[name], space, 0.4, 7)

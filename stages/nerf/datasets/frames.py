@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -15,11 +14,11 @@ from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry.rigid import inverse, is_rigid, nearest_rigid
 from fieldpose.stages.nerf.datasets.images import EXTENSIONS, ImageHeader, probe
 from fieldpose.stages.nerf.datasets.intrinsics import Intrinsics, camera_of
+from fieldpose.stages.nerf.datasets.parsing import converted, parse_json
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 RIGID_TOLERANCE = 1e-3
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-LFS_POINTER = "version https://git-lfs"
 NOT_OURS = frozenset({"scale", "offset", "aabb_scale", "applied_transform", "applied_scale", "time"})
 """Keys that other programs write, alike to some of these files' own."""
 UNSUPPORTED = frozenset({"k5", "k6", "rolling_shutter"})
@@ -58,17 +57,8 @@ class Document(Intrinsics, kw_only=True):
 
 def read_document(file: Path) -> Document:
     """Parse and check a file of frames. DatasetError if it is no such JSON or holds no frame."""
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-        if text.startswith(LFS_POINTER):
-            raise DatasetError(f"{file}: a pointer of Git LFS instead of the file itself; fetch it by `git lfs pull`")
-        content = json.loads(text)
-        document = msgspec.convert(content, Document)
-    except FileNotFoundError as error:
-        raise DatasetError(f"{file}: no such file") from error
-    except (OSError, ValueError, RecursionError) as error:
-        what = "not as expected" if isinstance(error, msgspec.ValidationError) else "not valid JSON"
-        raise DatasetError(f"{file}: {what} ({error}); export the dataset again") from error
+    content = parse_json(file)
+    document = converted(file, content, Document)
     if not document.frames:
         raise DatasetError(f"{file}: it has no frames; export the dataset again")
     check_keys(file, "", content, Document)

@@ -84,7 +84,7 @@ BLENDER: dict[str, tuple[Break, str]] = {
         r"transforms_train\.json: not as expected .*frames",
     ),
     "not JSON": (lambda r: text(r / TRAIN, "{'frames': []"), r"transforms_train\.json: not valid JSON"),
-    "not text": (lambda r: (r / TRAIN).write_bytes(b"\xff\xfe\x00"), r"transforms_train\.json: not valid JSON"),
+    "not text": (lambda r: (r / TRAIN).write_bytes(b"\xff\xfe\x00"), r"train\.json: not readable as text"),
     "a list": (lambda r: text(r / TRAIN, "[]"), r"transforms_train\.json: not as expected"),
     "deep nesting": (lambda r: text(r / TRAIN, "[" * 100_000), r"transforms_train\.json: not valid JSON"),
     "no frames key": (without(TRAIN, "frames"), r"transforms_train\.json: not as expected .*frames"),

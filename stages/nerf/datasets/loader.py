@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fieldpose.errors import DatasetError
-from fieldpose.stages.nerf.datasets import blender, colmap, llff, transforms
+from fieldpose.stages.nerf.datasets import blender, colmap, llff, seven_scenes, transforms, tum
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, Split, assemble, with_cameras
 from fieldpose.stages.nerf.datasets.records import Dataset, PosedCamera
 
@@ -55,6 +55,10 @@ def _read(root: Path, holdout: Holdout | None, normalise: bool, downscale: int |
     model = colmap.model_of(root)
     if model is not None:
         return colmap.read_colmap(root, model, holdout)
+    if seven_scenes.is_seven_scenes(root):
+        return seven_scenes.read_seven_scenes(root, holdout)
+    if (root / tum.FILE).is_file():
+        return tum.read_tum(root, holdout)
     names = f"{blender.TRAIN_FILE}, {transforms.FILE}, {llff.FILE} or a COLMAP model ({colmap.MODELS[0]})"
     raise DatasetError(f"{root}: not a dataset; expected {names} in it")
 

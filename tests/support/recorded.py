@@ -6,7 +6,9 @@ pose may be mistaken for another.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -73,3 +75,52 @@ def write_tum(root: Path, camera: Camera, count: int = 9) -> list[np.ndarray]:
     text(root / "rgb.txt", images)
     text(root / "depth.txt", depths)
     return poses
+
+
+OBJECT, OTHER = 5, 12
+MM = 1000.0
+
+
+def write_bop(root: Path, camera: Camera, count: int = 9, world: bool = True) -> list[np.ndarray]:
+    """A scene of two objects, OBJECT second where the number of the image is odd. Returns its poses, in mm.
+
+    The object stands still in its world, if that is told; the point at which the dot is seen is 1000 times made.POINT.
+    """
+    poses = made.poses_around(count)
+    world_from_object = inverse(poses[-1])
+    cameras, instances = {}, {}
+    for i, pose in enumerate(poses):
+        in_mm = pose.copy()
+        in_mm[:3, 3] *= MM
+        made.save(root / f"rgb/{i:06d}.png", made.picture(camera, pose))
+        made.save(root / f"depth/{i:06d}.png", np.full((camera.height, camera.width), 4000 + i, np.uint16))
+        shot: dict[str, Any] = {"cam_K": camera.matrix().ravel().tolist(), "depth_scale": 0.5}
+        if world:
+            cam_from_world = pose @ inverse(world_from_object)
+            shot |= {"cam_R_w2c": cam_from_world[:3, :3].ravel().tolist()}
+            shot |= {"cam_t_w2c": (MM * cam_from_world[:3, 3]).tolist()}
+        cameras[str(i)] = shot
+        both = [(OBJECT, in_mm), (OTHER, in_mm @ np.diag([-1.0, -1.0, 1.0, 1.0]))][:: -1 if i % 2 else 1]
+        instances[str(i)] = [
+            {"obj_id": k, "cam_R_m2c": m[:3, :3].ravel().tolist(), "cam_t_m2c": m[:3, 3].tolist()} for k, m in both
+        ]
+        for place, (k, _) in enumerate(both):
+            mask = np.zeros((camera.height, camera.width), np.uint8)
+            mask[: 10 if k == OBJECT else 3] = 255
+            made.save(root / f"mask_visib/{i:06d}_{place:06d}.png", mask)
+    made.write_json(root / "scene_camera.json", cameras)
+    made.write_json(root / "scene_gt.json", instances)
+    in_mm = np.stack(poses)
+    in_mm[:, :3, 3] *= MM
+    return list(in_mm)
+
+
+def one_object(root: Path) -> None:
+    """Leaves OBJECT alone in a scene, as in an onboarding sequence; masks are renamed."""
+    content = json.loads((root / "scene_gt.json").read_text())
+    for number, several in content.items():
+        place = next(i for i, one in enumerate(several) if one["obj_id"] == OBJECT)
+        name = f"{int(number):06d}"
+        (root / f"mask_visib/{name}_{place:06d}.png").replace(root / f"mask_visib/{name}_{0:06d}.png")
+        content[number] = [several[place]]
+    made.write_json(root / "scene_gt.json", content)

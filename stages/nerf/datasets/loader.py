@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fieldpose.errors import DatasetError
-from fieldpose.stages.nerf.datasets import blender, colmap, llff, seven_scenes, transforms, tum
+from fieldpose.stages.nerf.datasets import blender, bop, colmap, llff, seven_scenes, transforms, tum
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, Split, assemble, with_cameras
 from fieldpose.stages.nerf.datasets.records import Dataset, PosedCamera
 
@@ -43,7 +43,8 @@ def load_dataset(
 
 
 def _read(root: Path, holdout: Holdout | None, normalise: bool, downscale: int | None, size: int | None) -> Draft:
-    if not root.is_dir():
+    scene = bop.scene_of(root)
+    if not root.is_dir() and scene is None:
         what = "a file; give the folder that it is in" if root.exists() else "no such folder; give a dataset's folder"
         raise DatasetError(f"{root}: {what}")
     if (root / blender.TRAIN_FILE).is_file():
@@ -57,6 +58,8 @@ def _read(root: Path, holdout: Holdout | None, normalise: bool, downscale: int |
         return colmap.read_colmap(root, model, holdout)
     if seven_scenes.is_seven_scenes(root):
         return seven_scenes.read_seven_scenes(root, holdout)
+    if scene is not None:
+        return bop.read_bop(*scene, holdout)
     if (root / tum.FILE).is_file():
         return tum.read_tum(root, holdout)
     names = f"{blender.TRAIN_FILE}, {transforms.FILE}, {llff.FILE} or a COLMAP model ({colmap.MODELS[0]})"

@@ -130,5 +130,5 @@ def left_out(count: int, names: Sequence[str], why: str) -> tuple[str, ...]:
     """The note on those images, of `count`, that are left out; none where there are none."""
     if not names:
         return ()
-    are = "image is" if len(names) == 1 else "images are"
-    return (f"{len(names)} of {count} {are} left out, {why}: {listed(names)}",)
+    verb = "is" if len(names) == 1 else "are"
+    return (f"{len(names)} of {count} images {verb} left out ({why}): {listed(names)}",)

@@ -55,7 +55,7 @@ def read_seven_scenes(root: Path, holdout: Holdout | None) -> Draft:
         _record(root, path, pose, split or split_of(i, rule), given or ASSUMED)
         for i, (path, split, pose) in enumerate(posed)
     ]
-    notes += left_out(len(poses), lost, "since their pose is lost (not finite)")
+    notes += left_out(len(poses), lost, "the pose is lost, not finite")
     if given is None:
         notes += (
             f"7-Scenes has no calibration: a focal length of {ASSUMED.fx:g} px at {ASSUMED.width}x{ASSUMED.height} and"

@@ -65,7 +65,7 @@ def read_tum(root: Path, holdout: Holdout | None) -> Draft:
             )
         )  # fmt: skip
     check_distinct(root / FILE, records)
-    notes += left_out(len(listed), lost, f"since no poses within {LONGEST_GAP_S:g} s of each other are around them")
+    notes += left_out(len(listed), lost, f"no poses within {LONGEST_GAP_S:g} s of each other are around")
     return Draft("tum", records, metres_per_unit=1.0, unit="m", notes=notes)
 
 

@@ -57,8 +57,7 @@ def test_lost_frames_are_left_out(tmp_path: Path) -> None:
     dataset = load_dataset(tmp_path, "all")
     made.assert_poses(dataset, [pose for i, pose in enumerate(poses) if i not in (2, 5)], 1e-9)
     assert dataset.notes[0] == (
-        "2 of 9 images are left out, since their pose is lost (not finite): frame-000002.pose.txt,"
-        " frame-000005.pose.txt"
+        "2 of 9 images are left out (the pose is lost, not finite): frame-000002.pose.txt, frame-000005.pose.txt"
     )
     for path in tmp_path.glob("*.pose.txt"):
         recorded.text(path, "nan nan nan nan\n" * 4)

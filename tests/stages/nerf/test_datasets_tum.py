@@ -59,7 +59,7 @@ def test_images_in_a_gap_or_outside_are_left_out(root: Path) -> None:
     drop(root / "groundtruth.txt", 2, 6)
     dataset = load_dataset(root, "all")
     made.assert_poses(dataset, [pose for i, pose in enumerate(poses) if i not in (0, 3, 4)], 1e-5)
-    assert dataset.notes[1].startswith("3 of 9 images are left out, since no poses within 0.1 s of each other are")
+    assert dataset.notes[1].startswith("3 of 9 images are left out (no poses within 0.1 s of each other are around)")
     recorded.text(root / "groundtruth.txt", "1.0 0 0 0 0 0 0 1\n")
     with pytest.raises(DatasetError, match=r"groundtruth\.txt: no image of rgb\.txt is between two of its poses"):
         load_dataset(root)

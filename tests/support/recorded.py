@@ -124,3 +124,51 @@ def one_object(root: Path) -> None:
         (root / f"mask_visib/{name}_{place:06d}.png").replace(root / f"mask_visib/{name}_{0:06d}.png")
         content[number] = [several[place]]
     made.write_json(root / "scene_gt.json", content)
+
+
+def write_record3d(
+    root: Path, camera: Camera, count: int = 9, each: bool = False, images: str = "rgb"
+) -> list[np.ndarray]:
+    """An export; the last image was taken away. each: intrinsics for every image, not one K. Returns all poses."""
+    poses, told, coefficients = made.poses_around(count), [], []
+    for i, pose in enumerate(poses):
+        object_from_cam = np.array(made.opengl(pose))
+        told.append([*quaternion(object_from_cam), *object_from_cam[:3, 3].tolist()])
+        own = shifted(camera, i) if each else camera
+        coefficients.append([own.fx, own.fy, own.cx + 0.5, own.cy + 0.5])
+        if i < count - 1:
+            made.save(root / images / f"{i}.png", made.picture(own, pose))
+    fx, fy, cx, cy = coefficients[0]
+    content = {"poses": told, "w": camera.width, "h": camera.height, "fps": 60, "K": [fx, 0, 0, 0, fy, 0, cx, cy, 1]}
+    made.write_json(root / "metadata.json", content | ({"perFrameIntrinsicCoeffs": coefficients} if each else {}))
+    return poses
+
+
+def shifted(camera: Camera, index: int) -> Camera:
+    """As a lens that is held still by moving it."""
+    return Camera(camera.width, camera.height, camera.fx + index, camera.fy, camera.cx - 0.25 * index, camera.cy)
+
+
+def write_polycam(root: Path, camera: Camera, count: int = 9, corrected: bool = True) -> list[np.ndarray]:
+    """Raw data of which each image has a camera of its own, and depth of a quarter of its size.
+
+    Poses are those around the object, and y is up in the files. Returns them with z up. If corrected, the images as
+    they were taken are there as well, but show nothing.
+    """
+    poses = made.poses_around(count)
+    y_up_from_z_up = np.array([[0.0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    for i, pose in enumerate(poses):
+        own, name = shifted(camera, i), f"{1000 + 7 * i}"
+        stored = y_up_from_z_up @ np.array(made.opengl(pose))
+        content = {f"t_{row}{column}": float(stored[row, column]) for row in range(3) for column in range(4)}
+        content |= {"fx": own.fx, "fy": own.fy, "cx": own.cx + 0.5, "cy": own.cy + 0.5, "blur_score": 100.0}
+        content |= {"width": own.width, "height": own.height, "timestamp": 1000 + 7 * i}
+        for prefix in ("corrected_", "") if corrected else ("",):
+            seen = (
+                made.picture(own, pose) if prefix or not corrected else np.zeros((own.height, own.width, 3), np.uint8)
+            )
+            made.save(root / f"keyframes/{prefix}images/{name}.png", seen)
+            (root / f"keyframes/{prefix}cameras").mkdir(parents=True, exist_ok=True)
+            made.write_json(root / f"keyframes/{prefix}cameras/{name}.json", content)
+        made.save(root / f"keyframes/depth/{name}.png", np.full((own.height // 4, own.width // 4), 1250 + i, np.uint16))
+    return poses

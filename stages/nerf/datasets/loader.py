@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fieldpose.errors import DatasetError
-from fieldpose.stages.nerf.datasets import blender, bop, colmap, llff, seven_scenes, transforms, tum
+from fieldpose.stages.nerf.datasets import blender, bop, colmap, llff, polycam, record3d, seven_scenes, transforms, tum
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, Split, assemble, with_cameras
 from fieldpose.stages.nerf.datasets.records import Dataset, PosedCamera
+
+_UNPACK = "{}: a recording of Record3D that is not unpacked; unpack it as a zip, or export it as EXR + JPG"
 
 
 def load_dataset(
@@ -43,7 +45,9 @@ def load_dataset(
 
 
 def _read(root: Path, holdout: Holdout | None, normalise: bool, downscale: int | None, size: int | None) -> Draft:
-    scene = bop.scene_of(root)
+    scene, packed = bop.scene_of(root), record3d.packed_in(root)
+    if packed is not None and not root.is_dir():
+        raise DatasetError(_UNPACK.format(packed))
     if not root.is_dir() and scene is None:
         what = "a file; give the folder that it is in" if root.exists() else "no such folder; give a dataset's folder"
         raise DatasetError(f"{root}: {what}")
@@ -62,6 +66,13 @@ def _read(root: Path, holdout: Holdout | None, normalise: bool, downscale: int |
         return bop.read_bop(*scene, holdout)
     if (root / tum.FILE).is_file():
         return tum.read_tum(root, holdout)
+    if polycam.is_polycam(root):
+        return polycam.read_polycam(root, holdout)
+    metadata = record3d.metadata_of(root)
+    if metadata is not None:
+        return record3d.read_record3d(root, metadata, holdout)
+    if packed is not None:
+        raise DatasetError(_UNPACK.format(packed))
     names = f"{blender.TRAIN_FILE}, {transforms.FILE}, {llff.FILE} or a COLMAP model ({colmap.MODELS[0]})"
     raise DatasetError(f"{root}: not a dataset; expected {names} in it")
 

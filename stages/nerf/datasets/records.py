@@ -17,7 +17,7 @@ from fieldpose.stages.geometry.cameras import Camera
 from fieldpose.stages.nerf.datasets import images
 from fieldpose.stages.nerf.datasets.bounds import SceneBounds
 
-Kind = Literal["blender", "transforms", "llff", "colmap", "7scenes", "tum", "bop"]
+Kind = Literal["blender", "transforms", "llff", "colmap", "7scenes", "tum", "bop", "record3d", "polycam"]
 Scene = Literal["object", "bounded", "unbounded"]
 
 

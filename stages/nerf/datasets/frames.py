@@ -21,9 +21,14 @@ RIGID_TOLERANCE = 1e-3
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 NOT_OURS = frozenset({"scale", "offset", "aabb_scale", "applied_transform", "applied_scale", "time"})
 """Keys that other programs write, alike to some of these files' own."""
-UNSUPPORTED = frozenset({"k5", "k6", "rolling_shutter"})
-"""Keys that say what this reader has no model for, unless they say nothing."""
-_UNSUPPORTED_HOW = "undistort the images to a pinhole camera first, or take the key out if it means nothing"
+_A_LENS = "undistort the images to a pinhole camera first, or take the key out if it means nothing"
+_OTHER_AXES = "write poses in OpenGL's camera axes (x right, y up, z back) and take the key out"
+UNSUPPORTED = {
+    **dict.fromkeys(("k5", "k6", "rolling_shutter", "latlong", "equirectangular", "orthographic"), _A_LENS),
+    **dict.fromkeys((f"ftheta_p{i}" for i in range(5)), _A_LENS),
+    **dict.fromkeys(("from_mitsuba", "from_na"), _OTHER_AXES),
+}
+"""Keys, of instant-ngp the most, that say what this reader has no model for unless they say nothing; and what to do."""
 _MISSPELT = 0.74
 _MATTER = ("transform_matrix", "frames", "aabb", "object_aabb", "metres_per_unit")
 _OF_OTHERS = ("_id", "_label", "_path", "_name", "_index")
@@ -81,9 +86,9 @@ def check_keys(file: Path, where: str, content: Mapping[str, object], known: typ
         meant = difflib.get_close_matches(key, matter, 1, _MISSPELT)
         if meant:
             raise DatasetError(f"{file}: {where}{key!r} is no key of this file; is {meant[0]!r} meant?")
-    for key in sorted(UNSUPPORTED & content.keys()):
+    for key in sorted(UNSUPPORTED.keys() & content.keys()):
         if content[key] not in (0, 0.0, None, [], False):
-            raise DatasetError(f"{file}: {where}{key} is {content[key]!r}, which is not supported; {_UNSUPPORTED_HOW}")
+            raise DatasetError(f"{file}: {where}{key} is {content[key]!r}, which is not supported; {UNSUPPORTED[key]}")
 
 
 def find_image(root: Path, file_path: str) -> Path | None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets import blender, bop, colmap, llff, polycam, record3d, seven_scenes, transforms, tum
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, Split, assemble, with_cameras
+from fieldpose.stages.nerf.datasets.masks import with_masks
 from fieldpose.stages.nerf.datasets.records import Dataset, PosedCamera
 
 _UNPACK = "{}: a recording of Record3D that is not unpacked; unpack it as a zip, or export it as EXR + JPG"
@@ -35,6 +36,8 @@ def load_dataset(
     root = Path(path)
     _check_options(root, size, downscale)
     draft = _read(root, holdout, llff_normalise, downscale, size)
+    if draft.kind != "blender":
+        draft = with_masks(_home(root), draft)
     dataset = assemble(root, draft if cameras is None else with_cameras(draft, cameras), split)
     if size is not None:
         return dataset.resized(size)
@@ -42,6 +45,12 @@ def load_dataset(
         longest = max(max(record.camera.width, record.camera.height) for record in dataset.images)
         return dataset.resized(max(1, round(longest / downscale)))
     return dataset
+
+
+def _home(root: Path) -> Path:
+    """The folder of the dataset that a path means, which may go on to name an object in it."""
+    scene = bop.scene_of(root)
+    return root if scene is None else scene[0]
 
 
 def _read(root: Path, holdout: Holdout | None, normalise: bool, downscale: int | None, size: int | None) -> Draft:

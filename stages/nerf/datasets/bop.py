@@ -18,10 +18,10 @@ from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry import Camera, inverse, rotation_error_deg
 from fieldpose.stages.geometry.rigid import from_rotation
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
-from fieldpose.stages.nerf.datasets.frames import checked_rigid, find_image, relative_name
+from fieldpose.stages.nerf.datasets.frames import find_image, relative_name
 from fieldpose.stages.nerf.datasets.images import probe
 from fieldpose.stages.nerf.datasets.intrinsics import checked_camera
-from fieldpose.stages.nerf.datasets.parsing import left_out, listed, matrix, read_json
+from fieldpose.stages.nerf.datasets.parsing import checked_rigid, left_out, listed, matrix, read_json
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 CAMERAS, POSES = "scene_camera.json", "scene_gt.json"

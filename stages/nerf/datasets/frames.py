@@ -11,13 +11,12 @@ import msgspec
 import numpy as np
 
 from fieldpose.errors import DatasetError
-from fieldpose.stages.geometry.rigid import inverse, is_rigid, nearest_rigid
+from fieldpose.stages.geometry.rigid import inverse
 from fieldpose.stages.nerf.datasets.images import EXTENSIONS, ImageHeader, probe
 from fieldpose.stages.nerf.datasets.intrinsics import Intrinsics, camera_of
-from fieldpose.stages.nerf.datasets.parsing import converted, parse_json
+from fieldpose.stages.nerf.datasets.parsing import checked_rigid, converted, parse_json
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
-RIGID_TOLERANCE = 1e-3
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 NOT_OURS = frozenset({"scale", "offset", "aabb_scale", "applied_transform", "applied_scale", "time"})
 """Keys that other programs write, alike to some of these files' own."""
@@ -99,7 +98,10 @@ def find_image(root: Path, file_path: str) -> Path | None:
     """
     parts = PurePosixPath(file_path.replace("\\", "/")).parts
     for first in range(len(parts)):
-        found = _image_at(root.joinpath(*parts[first:]))
+        try:
+            found = _image_at(root.joinpath(*parts[first:]))
+        except (OSError, ValueError):  # no name that a file can have, as one that is empty or too long
+            continue
         if found is not None:
             return found
     return None
@@ -139,20 +141,6 @@ def check_distinct(file: Path | str, records: Sequence[ImageRecord]) -> None:
         if record.name in seen:
             raise DatasetError(f"{file}: {record.name} is listed twice; take one of its frames out")
         seen.add(record.name)
-
-
-def checked_rigid(object_from_cam: np.ndarray, where: str) -> np.ndarray:
-    """The rigid transform that a stored matrix is, its rounding removed. DatasetError if it is not nearly one."""
-    if not np.all(np.isfinite(object_from_cam)):
-        raise DatasetError(f"{where}: the pose has a number that is not finite; take the image out or pose it again")
-    if not is_rigid(object_from_cam, RIGID_TOLERANCE):
-        scale = np.linalg.norm(object_from_cam[:3, :3], axis=0)
-        determinant = np.linalg.det(object_from_cam[:3, :3])
-        raise DatasetError(
-            f"{where}: the pose is not rigid (column lengths {np.round(scale, 4).tolist()}, determinant"
-            f" {determinant:.4g}, last row {object_from_cam[3].tolist()}); export rigid poses"
-        )
-    return nearest_rigid(object_from_cam)
 
 
 def relative_name(root: Path, path: Path) -> str:

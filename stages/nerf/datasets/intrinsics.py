@@ -139,4 +139,6 @@ def check_invertible(camera: Camera) -> None:
     """GeometryError for a lens that folds its image's corners over it."""
     if camera.is_distorted:
         right, bottom = camera.width - 0.5, camera.height - 0.5
-        camera.directions(np.array([(-0.5, -0.5), (right, -0.5), (-0.5, bottom), (right, bottom)]))
+        corners = np.array([(-0.5, -0.5), (right, -0.5), (-0.5, bottom), (right, bottom)])
+        with np.errstate(over="ignore", invalid="ignore"):
+            camera.directions(corners)

@@ -9,9 +9,10 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fieldpose.errors import DatasetError, SourceError
-from fieldpose.stages.geometry import Camera
+from fieldpose.stages.geometry import RIGID_TOLERANCE, Camera, is_rigid, nearest_rigid
 from fieldpose.stages.geometry.rigid import from_rotation
 
 LFS_POINTER = "version https://git-lfs"
@@ -20,6 +21,8 @@ CAMERA_FILE = "camera.json"
 _QUATERNION_TOLERANCE = 0.01
 _AGAIN = "export the dataset again"
 _FEW = 3
+_LARGEST = 1e15
+"""Of a pose: no scene has larger numbers, whose products would overflow."""
 _T = TypeVar("_T")
 
 
@@ -92,6 +95,19 @@ def matrix(where: str, name: str, values: Sequence[float] | None, rows: int, col
     return np.array(values, dtype=np.float64).reshape(rows, columns)
 
 
+def checked_rigid(object_from_cam: np.ndarray, where: str) -> np.ndarray:
+    """The rigid transform that a stored matrix is, its rounding removed. DatasetError if it is not nearly one."""
+    _check_finite(where, object_from_cam)
+    if not is_rigid(object_from_cam, RIGID_TOLERANCE):
+        scale = np.linalg.norm(object_from_cam[:3, :3], axis=0)
+        determinant = np.linalg.det(object_from_cam[:3, :3])
+        raise DatasetError(
+            f"{where}: the pose is not rigid (column lengths {np.round(scale, 4).tolist()}, determinant"
+            f" {determinant:.4g}, last row {object_from_cam[3].tolist()}); export rigid poses"
+        )
+    return nearest_rigid(object_from_cam)
+
+
 def posed_by_quaternion(where: str, xyzw: Sequence[float], position: Sequence[float]) -> np.ndarray:
     """(4, 4) of a quaternion (x, y, z, w) and a position (x, y, z).
 
@@ -99,13 +115,19 @@ def posed_by_quaternion(where: str, xyzw: Sequence[float], position: Sequence[fl
     """
     from scipy.spatial.transform import Rotation
 
-    if not np.isfinite([*xyzw, *position]).all():
-        raise DatasetError(f"{where}: the pose has a number that is not finite; take the image out or pose it again")
-    with np.errstate(over="ignore"):
-        length = float(np.linalg.norm(xyzw))
+    _check_finite(where, [*xyzw, *position])
+    length = float(np.linalg.norm(xyzw))
     if abs(length - 1) > _QUATERNION_TOLERANCE:
         raise DatasetError(f"{where}: the quaternion has length {length:.4g}, not 1; export rigid poses")
     return from_rotation(Rotation.from_quat(np.array(xyzw, dtype=np.float64)), position)
+
+
+def _check_finite(where: str, pose: ArrayLike) -> None:
+    if not (np.abs(pose) <= _LARGEST).all():
+        raise DatasetError(
+            f"{where}: the pose has a number that is not finite, or beyond {_LARGEST:g}; take the image out or pose it"
+            " again"
+        )
 
 
 def camera_beside(root: Path) -> Camera | None:

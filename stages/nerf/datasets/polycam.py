@@ -13,10 +13,10 @@ import numpy as np
 from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry import inverse
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
-from fieldpose.stages.nerf.datasets.frames import OPENCV_FROM_OPENGL, checked_rigid, find_image, relative_name
+from fieldpose.stages.nerf.datasets.frames import OPENCV_FROM_OPENGL, find_image, relative_name
 from fieldpose.stages.nerf.datasets.images import is_image_name
 from fieldpose.stages.nerf.datasets.intrinsics import checked_camera, fitted
-from fieldpose.stages.nerf.datasets.parsing import left_out, read_json
+from fieldpose.stages.nerf.datasets.parsing import checked_rigid, left_out, read_json
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 PIXEL_CENTRE = 0.5

@@ -15,9 +15,17 @@ import numpy as np
 from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry import Camera, inverse
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
-from fieldpose.stages.nerf.datasets.frames import checked_rigid, find_image, relative_name
+from fieldpose.stages.nerf.datasets.frames import find_image, relative_name
 from fieldpose.stages.nerf.datasets.intrinsics import fitted
-from fieldpose.stages.nerf.datasets.parsing import CAMERA_FILE, camera_beside, left_out, listed, numbers, read_rows
+from fieldpose.stages.nerf.datasets.parsing import (
+    CAMERA_FILE,
+    camera_beside,
+    checked_rigid,
+    left_out,
+    listed,
+    numbers,
+    read_rows,
+)
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 ASSUMED = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)

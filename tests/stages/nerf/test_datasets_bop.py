@@ -87,6 +87,11 @@ def test_without_masks_and_without_a_world_it_is_said(tmp_path: Path) -> None:
     assert "as if it stood still with it; there is no mask_visib" in dataset.notes[0]
     with pytest.raises(DatasetError, match="the dataset has no mask"):
         dataset.load_mask(0)
+    for i in range(9):
+        made.save(tmp_path / f"masks/{i:06d}.png", np.eye(24, 32, dtype=np.uint8))
+    learnt = load_dataset(tmp_path / "obj_000005", "all").load_learnt(0)
+    assert learnt is not None
+    assert learnt.sum() == 24
 
 
 def test_images_without_the_object_or_with_two_of_it_are_left_out(tmp_path: Path) -> None:

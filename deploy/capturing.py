@@ -296,7 +296,8 @@ def _write(
         write_bytes(out / IMAGES / shot.name, shot.jpeg)
         report("writing the images", (i + 1) / len(chosen))
     write_json(out / CAMERA_FILE, cameras[0])
-    write_json(out / FILE, transforms_document(names, cameras, poses, held_out, metres))
+    about = {} if metres is None else {"metres_per_unit": metres}
+    write_json(out / FILE, transforms_document(names, cameras, poses, held_out or None, about))
     return Captured(
         len(chosen), len(shots.chosen), len(shots.blurred), shots.seen, structure.why_not(mapped), cameras[0],
         mapped.error_px * cameras[0].width / mapped.camera.width, standing.on_plane, metres,

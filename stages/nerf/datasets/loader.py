@@ -29,7 +29,7 @@ def load_dataset(
     split: "all" keeps both, each image says which it is in. size: the longer side in pixels to shrink images to.
     downscale: shrink by this factor instead; LLFF takes the folder of that factor. holdout, for kinds without
     splits of their own: "odd" or "every8" images (sorted by name) are test, None holds nothing out, "auto" is "odd"
-    for transforms.json and "every8" for LLFF and COLMAP. llff_normalise: see llff.read_llff. cameras: of all images,
+    for transforms.json and "every8" for others. llff_normalise: see llff.read_llff. cameras: of all images,
     both splits, in their order, instead of those that the files tell.
     Raises DatasetError, one line that names the file and says how to mend it.
     """
@@ -82,8 +82,11 @@ def _read(root: Path, holdout: Holdout | None, normalise: bool, downscale: int |
         return record3d.read_record3d(root, metadata, holdout)
     if packed is not None:
         raise DatasetError(_UNPACK.format(packed))
-    names = f"{blender.TRAIN_FILE}, {transforms.FILE}, {llff.FILE} or a COLMAP model ({colmap.MODELS[0]})"
-    raise DatasetError(f"{root}: not a dataset; expected {names} in it")
+    raise DatasetError(
+        f"{root}: not a dataset; expected {blender.TRAIN_FILE}, {transforms.FILE}, {llff.FILE}, a COLMAP model"
+        f" ({colmap.MODELS[0]}), BOP's {bop.CAMERAS}, TUM's {tum.FILE}, frame-*.pose.txt of 7-Scenes, Polycam's"
+        " keyframes or Record3D's metadata.json in it"
+    )
 
 
 def _check_options(root: Path, size: int | None, downscale: int | None) -> None:

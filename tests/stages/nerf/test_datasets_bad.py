@@ -228,7 +228,7 @@ def test_all_images_deleted(tmp_path: Path) -> None:
 
 def test_folders_that_are_no_dataset(tmp_path: Path) -> None:
     assert_refused(
-        tmp_path, "not a dataset; expected transforms_train.json, transforms.json, poses_bounds.npy or a COLMAP model"
+        tmp_path, "not a dataset; expected transforms_train.json, transforms.json, poses_bounds.npy, a COLMAP model"
     )
     assert_refused(tmp_path / "nowhere", "no such folder")
     text(tmp_path / "file.json", "{}")

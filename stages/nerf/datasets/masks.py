@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets.assemble import Draft
-from fieldpose.stages.nerf.datasets.images import EXTENSIONS, probe
+from fieldpose.stages.nerf.datasets.images import EXTENSIONS, is_image_name, probe
 from fieldpose.stages.nerf.datasets.intrinsics import same_shape
 from fieldpose.stages.nerf.datasets.parsing import listed
 from fieldpose.stages.nerf.datasets.records import ImageRecord
@@ -24,11 +25,12 @@ def with_masks(root: Path, draft: Draft) -> Draft:
     """
     if any(record.learnt_path is not None or record.mask_path is not None for record in draft.records):
         return draft
-    folders = {folder for record in draft.records for folder in _ways(root, record)}
-    if not any((folder / FOLDER).is_dir() for folder in folders):
+    ways = {folder for record in draft.records for folder in _ways(root, record)}
+    there = {folder: _files(folder / FOLDER) for folder in sorted(ways) if (folder / FOLDER).is_dir()}
+    if not there:
         return draft
-    masks = {record.name: _mask_of(root, record) for record in draft.records}
-    where = next(folder / FOLDER for folder in sorted(folders) if (folder / FOLDER).is_dir())
+    where = next(iter(there)) / FOLDER
+    masks = {record.name: _mask_of(root, record, there) for record in draft.records}
     without = [name for name, mask in masks.items() if mask is None]
     if without:
         raise DatasetError(
@@ -49,15 +51,19 @@ def _ways(root: Path, record: ImageRecord) -> list[Path]:
     return [root.joinpath(*parts[:i]) for i in range(len(parts) + 1)]
 
 
-def _mask_of(root: Path, record: ImageRecord) -> Path | None:
+def _files(folder: Path) -> dict[str, Path]:
+    """Images in a folder and below, by their paths there in lower case."""
+    return {path.relative_to(folder).as_posix().lower(): path for path in folder.rglob("*") if is_image_name(path)}
+
+
+def _mask_of(root: Path, record: ImageRecord, there: Mapping[Path, Mapping[str, Path]]) -> Path | None:
     for folder in _ways(root, record):
         whole = record.path.relative_to(folder)
         for image in (whole, Path(*whole.parts[1:])) if len(whole.parts) > 1 else (whole,):
-            name = folder / FOLDER / image
-            for named in (name, name.with_suffix("")):
-                found = next((p for e in EXTENSIONS if (p := named.with_name(named.name + e)).is_file()), None)
-                if found is not None:
-                    return found
+            names = (f"{named.as_posix().lower()}{e}" for named in (image, image.with_suffix("")) for e in EXTENSIONS)
+            found = next((name for name in names if name in there.get(folder, {})), None)
+            if found is not None:
+                return there[folder][found]
     return None
 
 

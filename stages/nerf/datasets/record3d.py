@@ -22,6 +22,7 @@ PACKED = ".r3d"
 PIXEL_CENTRE = 0.5
 _FILES = ("metadata.json", "metadata")
 _IMAGES = ("rgb", "EXR_RGBD/rgb", "rgbd")
+_DEPTHS = ("depth", "EXR_RGBD/depth")
 
 
 class Metadata(msgspec.Struct, rename={"k": "K", "coefficients": "perFrameIntrinsicCoeffs"}):
@@ -75,7 +76,10 @@ def read_record3d(root: Path, file: Path, holdout: Holdout | None) -> Draft:
             ImageRecord(relative_name(root, path), path, camera, inverse(object_from_cam), split_of(i, rule))
         )
     missing = [str(number) for number in range(len(poses)) if number not in images]
-    return Draft("record3d", records, metres_per_unit=1.0, unit="m", notes=left_out(len(poses), missing, "no image"))
+    notes = left_out(len(poses), missing, "no image")
+    if any((root / folder).is_dir() for folder in _DEPTHS):
+        notes += ("depth, which is EXR, is not read",)
+    return Draft("record3d", records, metres_per_unit=1.0, unit="m", notes=notes)
 
 
 def _images(root: Path) -> dict[int, Path]:

@@ -68,6 +68,7 @@ def test_extensions_may_differ_and_sizes_but_not_shapes(tmp_path: Path) -> None:
     made.write_transforms(tmp_path, CAMERA)
     for i in range(7):
         made.save(tmp_path / f"masks/{i:04d}.bmp", np.kron(mask(i), np.ones((2, 2), np.uint8)))
+    (tmp_path / "masks/0004.bmp").rename(tmp_path / "masks/0004.BMP")
     learnt = load_dataset(tmp_path, "all").load_learnt(4)
     assert learnt is not None
     np.testing.assert_array_equal(learnt, mask(4) > 0)

@@ -37,7 +37,10 @@ def test_record3d(tmp_path: Path, camera: Camera, each: bool, images: str) -> No
 def test_record3d_of_an_unpacked_file_and_of_one_that_is_not(tmp_path: Path) -> None:
     recorded.write_record3d(tmp_path / "a", CAMERA, images="rgbd")
     (tmp_path / "a/metadata.json").rename(tmp_path / "a/metadata")
-    assert len(load_dataset(tmp_path / "a", "all")) == 8
+    (tmp_path / "a/depth").mkdir()
+    dataset = load_dataset(tmp_path / "a", "all")
+    assert len(dataset) == 8
+    assert dataset.notes[1:] == ("depth, which is EXR, is not read",)
     packed = tmp_path / "b/mine.r3d"
     recorded.text(packed, "PK")
     for path in (packed, packed.parent):

@@ -35,7 +35,7 @@ class Options:
     to: Literal["transforms", "colmap"]
     """What to write."""
     images: bool = True
-    """--no-images: write cameras, depths and masks alone, where the photographs are brought there otherwise."""
+    """Copy the photographs; without them, cameras, depths and masks alone are written."""
     holdout: Literal["auto", "odd", "every8", "none"] = "auto"
     """Which images of a dataset without splits of its own are held out, as `train` has it; for transforms alone."""
 

@@ -308,7 +308,10 @@ def _write(
         pictures = [boxed(chosen[i].image(), cameras[i], poses[i], box) for i in shown]
         write_bytes(out / OBJECT_PICTURE, encoded(sheet(pictures), out / OBJECT_PICTURE))
     write_json(out / CAMERA_FILE, cameras[0])
-    write_json(out / FILE, transforms_document(names, cameras, poses, held_out, metres, box))
+    about: dict[str, object] = {} if metres is None else {"metres_per_unit": metres}
+    if box is not None:
+        about["object_aabb"] = box.tolist()
+    write_json(out / FILE, transforms_document(names, cameras, poses, held_out or None, about))
     return Captured(
         len(chosen), len(shots.chosen), len(shots.blurred), shots.seen, structure.why_not(mapped), cameras[0],
         mapped.error_px * cameras[0].width / mapped.camera.width, standing.on_plane, metres,

@@ -20,6 +20,7 @@ from fieldpose.errors import UsageError
 COMMANDS = {
     "demo": "the embedded scene through the whole pipeline",
     "capture": "a video or photographs -> posed images to train on",
+    "convert": "posed images of one kind as those of another, for other programs",
     "train": "posed images -> a field (.safetensors)",
     "estimate": "one image, in one process, without a bus",
     "run": "the pipeline: a source of images through every stage, each a process",

@@ -13,9 +13,9 @@ import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fieldpose.deploy.capturing import ENOUGH, FEWEST, OBJECT_PICTURE, Captured, Square, advice, capture, summary
-from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
+from fieldpose.deploy.reporting.output import check_new_folder, check_writable, progress_console, write_json
 from fieldpose.deploy.shots import FILMED_S
-from fieldpose.errors import OutputError, UsageError
+from fieldpose.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -65,9 +65,8 @@ class Options:
             raise UsageError(f"--seconds {self.seconds}: expected more than 0")
         if self.marker is not None and not 0 < self.marker < float("inf"):
             raise UsageError(f"--marker {self.marker}: expected the length of a side in metres")
-        if self.out.exists() and (not self.out.is_dir() or any(self.out.iterdir())):
-            raise OutputError(f"{self.out}: is there already and not empty; name another folder, or remove it")
-        check_writable(self.out.with_name(f"{self.out.name}.partial"), self.json)
+        check_new_folder(self.out)
+        check_writable(self.json)
         began = time.monotonic()
         with _progress_bar() as report:
             square = None if self.marker is None else Square(self.family, self.marker)

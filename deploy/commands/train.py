@@ -35,10 +35,11 @@ class Options:
     Example: fieldpose train ../shared/data/lego --size 400 --minutes 5 --out out/lego.safetensors
 
     The kind of dataset is recognised from its folder: Blender/NeRF-synthetic, transforms.json (instant-ngp,
-    nerfstudio), LLFF, or a COLMAP model with its images. First its cameras are compared with the images, and adjusted
-    where they do not fit. Ctrl-C ends the training early and keeps what was learnt. In the end some of the training
-    images are looked for in the field, which tells how exact poses are to be expected, and whether the dataset's own
-    are in order. The JSON file has:
+    nerfstudio), LLFF, a COLMAP model with its images, a scene of BOP (SCENE/obj_000005 where it has several objects),
+    7-Scenes, TUM RGB-D, or what Polycam and Record3D export. First its cameras are compared with the images, and
+    adjusted where they do not fit. Ctrl-C ends the training early and keeps what was learnt. In the end some of the
+    training images are looked for in the field, which tells how exact poses are to be expected, and whether the
+    dataset's own are in order. The JSON file has:
     psnr_db (mean over the held-out views, null without any), psnr_db_by_view, accuracy (images, found, rotation_deg and
     translation, medians, error_scale, how many times larger errors are than an image shows; null where too few were
     found), cameras (verdict: fit, adjusted, too few or no fit; before_px, after_px, rotation_deg, translation,
@@ -58,7 +59,7 @@ class Options:
     --training.backend)."""
     holdout: Literal["auto", "odd", "every8", "none"] = "auto"
     """Which images of a dataset without splits of its own are held out: auto is odd for transforms.json, every8 for
-    LLFF and COLMAP."""
+    others."""
     cameras: Literal["auto", "given"] = "auto"
     """auto: where the images' own matches show that poses, focal length or distortion are off by more than is seen,
     they are adjusted before the training, in the dataset's frame and unit; else they are kept as they are. given: they

@@ -54,6 +54,14 @@ def check_picture(path: Path | None) -> None:
         raise OutputError(f"{path}: no name of a plot; end it in {', '.join(PICTURES[:-1])} or {PICTURES[-1]}")
 
 
+def check_new_folder(path: Path) -> None:
+    """Raise OutputError where a folder that is empty or not there could not be written later."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise OutputError(f"{path}: is there already and not empty; name another folder, or remove it")
+    whole = path.absolute()
+    check_writable(whole.with_name(f"{whole.name}.partial"))
+
+
 def check_writable(*paths: Path | None) -> None:
     """Raise OutputError where a file could not be written later, before long work is begun."""
     for path in paths:

@@ -64,7 +64,7 @@ def test_each_command_describes_itself_with_an_example(name: str, capsys: pytest
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["runn"], "no command 'runn'; expected one of demo, capture, train"),
+        (["runn"], "no command 'runn'; expected one of demo, capture, convert, train"),
         (["run", "f", "--nonsense", "3"], "Unrecognized options: --nonsense"),
         (["run", "f", "--tracking.deth", "3"], "did you mean --tracking.depth?"),
         (["run"], "no field; give one, or several"),
@@ -73,6 +73,9 @@ def test_each_command_describes_itself_with_an_example(name: str, capsys: pytest
         (["info", "nothing.mcap"], "nothing.mcap: cannot be read: No such file"),
         (["recover", "nothing.mcap"], "nothing.mcap: cannot be read"),
         (["run", "nothing.safetensors", "--source", "camera:0"], "nothing.safetensors: no such field file"),
+        (["convert", "nothing", "out", "--to", "colmap"], "nothing: no such folder"),
+        (["convert", "nothing", "out"], "--to"),
+        (["convert", "nothing", ".", "--to", "gltf"], "--to"),
         (["train", "nothing", "--out", "f.safetensors"], "nothing: no such folder"),
         (["stage", "pnp", "--connect", "nowhere"], "'nowhere' is no address of a hub"),
         (["stage", "pnp", "--pipelines", "nothing.json"], "nothing.json: no such configuration file"),

@@ -15,6 +15,7 @@ import numpy as np
 from PIL import Image
 
 from fieldpose.stages.geometry import Camera, inverse, look_at
+from fieldpose.stages.nerf.datasets import Dataset
 
 POINT = np.array([0.25, -0.15, 0.2])
 CAMERA = Camera(96, 64, 110.0, 108.0, 46.0, 33.5)
@@ -58,6 +59,19 @@ def dot_in(image: np.ndarray) -> np.ndarray:
     weight = image[..., -1].astype(np.float64) ** 2
     y, x = np.mgrid[: image.shape[0], : image.shape[1]]
     return np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
+
+
+def worst_dot_px(dataset: Dataset, point: np.ndarray = POINT) -> float:
+    """How far from its projection the point is in the loaded images, at most."""
+    return max(
+        float(np.linalg.norm(dot_in(image) - seen_at(record.camera, record.cam_from_object, point)))
+        for image, record in zip(dataset.load_images(), dataset.images, strict=True)
+    )
+
+
+def assert_poses(dataset: Dataset, poses: Sequence[np.ndarray], within: float = 1e-6) -> None:
+    found = np.stack([record.cam_from_object for record in dataset.images])
+    np.testing.assert_allclose(found, np.stack(poses), atol=within)
 
 
 def save(path: Path, pixels: np.ndarray) -> None:

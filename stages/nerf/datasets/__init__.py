@@ -1,4 +1,4 @@
-"""Readers of posed photographs: NeRF-synthetic, transforms.json and LLFF, behind one load_dataset."""
+"""Readers of posed photographs, of many kinds, behind one load_dataset; and writers of two."""
 
 from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets.bounds import SceneBounds

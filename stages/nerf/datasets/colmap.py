@@ -5,18 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from fieldpose.errors import DatasetError, GeometryError
-from fieldpose.stages.geometry import Camera
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
 from fieldpose.stages.nerf.datasets.frames import check_distinct, find_image, relative_name
-from fieldpose.stages.nerf.datasets.images import probe
-from fieldpose.stages.nerf.datasets.intrinsics import check_invertible
+from fieldpose.stages.nerf.datasets.intrinsics import check_invertible, fitted
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 MODELS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "colmap", ".")
 """Where a model may be, below a dataset's folder."""
 IMAGES = ("images", ".")
 _FILES = ({"cameras.bin", "images.bin"}, {"cameras.txt", "images.txt"})
-_ASPECT_TOLERANCE = 0.01
 
 
 def model_of(root: Path) -> Path | None:
@@ -47,7 +44,7 @@ def read_colmap(root: Path, model: Path, holdout: Holdout | None) -> Draft:
             raise DatasetError(f"{root}: no image {image.name}, but {model} lists it; restore it in {root / IMAGES[0]}")
         split = split_of(i, "every8" if holdout == "auto" else holdout)
         records.append(
-            ImageRecord(relative_name(root, path), path, _fitted(path, image.camera), image.cam_from_world, split)
+            ImageRecord(relative_name(root, path), path, fitted(path, image.camera), image.cam_from_world, split)
         )
     check_distinct(model, records)
     for camera in {record.camera for record in records}:
@@ -63,19 +60,3 @@ def _notes(root: Path, model: Path) -> tuple[str, ...]:
     if model == root or not model.name.isdecimal() or not others:
         return ()
     return (f"{model} is read; its neighbours are not: {', '.join(others)}",)
-
-
-def _fitted(path: Path, camera: Camera) -> Camera:
-    """The camera at the size of the file, which may have been shrunk since it was mapped."""
-    header = probe(path)
-    if (header.width, header.height) == (camera.width, camera.height):
-        return camera
-    if (
-        abs(camera.width * header.height - camera.height * header.width)
-        > _ASPECT_TOLERANCE * camera.width * header.height
-    ):
-        raise DatasetError(
-            f"{path}: the image has {header.width}x{header.height} pixels, its camera {camera.width}x{camera.height},"
-            " another shape; restore the images that were mapped"
-        )
-    return camera.resized(header.width, header.height)

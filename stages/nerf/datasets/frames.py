@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -12,19 +11,23 @@ import msgspec
 import numpy as np
 
 from fieldpose.errors import DatasetError
-from fieldpose.stages.geometry.rigid import inverse, is_rigid, nearest_rigid
+from fieldpose.stages.geometry.rigid import inverse
 from fieldpose.stages.nerf.datasets.images import EXTENSIONS, ImageHeader, probe
 from fieldpose.stages.nerf.datasets.intrinsics import Intrinsics, camera_of
+from fieldpose.stages.nerf.datasets.parsing import checked_rigid, converted, parse_json
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
-RIGID_TOLERANCE = 1e-3
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-LFS_POINTER = "version https://git-lfs"
 NOT_OURS = frozenset({"scale", "offset", "aabb_scale", "applied_transform", "applied_scale", "time"})
 """Keys that other programs write, alike to some of these files' own."""
-UNSUPPORTED = frozenset({"k5", "k6", "rolling_shutter"})
-"""Keys that say what this reader has no model for, unless they say nothing."""
-_UNSUPPORTED_HOW = "undistort the images to a pinhole camera first, or take the key out if it means nothing"
+_A_LENS = "undistort the images to a pinhole camera first, or take the key out if it means nothing"
+_OTHER_AXES = "write poses in OpenGL's camera axes (x right, y up, z back) and take the key out"
+UNSUPPORTED = {
+    **dict.fromkeys(("k5", "k6", "rolling_shutter", "latlong", "equirectangular", "orthographic"), _A_LENS),
+    **dict.fromkeys((f"ftheta_p{i}" for i in range(5)), _A_LENS),
+    **dict.fromkeys(("from_mitsuba", "from_na"), _OTHER_AXES),
+}
+"""Keys, of instant-ngp the most, that say what this reader has no model for unless they say nothing; and what to do."""
 _MISSPELT = 0.74
 _MATTER = ("transform_matrix", "frames", "aabb", "object_aabb", "metres_per_unit")
 _OF_OTHERS = ("_id", "_label", "_path", "_name", "_index")
@@ -58,17 +61,8 @@ class Document(Intrinsics, kw_only=True):
 
 def read_document(file: Path) -> Document:
     """Parse and check a file of frames. DatasetError if it is no such JSON or holds no frame."""
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-        if text.startswith(LFS_POINTER):
-            raise DatasetError(f"{file}: a pointer of Git LFS instead of the file itself; fetch it by `git lfs pull`")
-        content = json.loads(text)
-        document = msgspec.convert(content, Document)
-    except FileNotFoundError as error:
-        raise DatasetError(f"{file}: no such file") from error
-    except (OSError, ValueError, RecursionError) as error:
-        what = "not as expected" if isinstance(error, msgspec.ValidationError) else "not valid JSON"
-        raise DatasetError(f"{file}: {what} ({error}); export the dataset again") from error
+    content = parse_json(file)
+    document = converted(file, content, Document)
     if not document.frames:
         raise DatasetError(f"{file}: it has no frames; export the dataset again")
     check_keys(file, "", content, Document)
@@ -91,9 +85,9 @@ def check_keys(file: Path, where: str, content: Mapping[str, object], known: typ
         meant = difflib.get_close_matches(key, matter, 1, _MISSPELT)
         if meant:
             raise DatasetError(f"{file}: {where}{key!r} is no key of this file; is {meant[0]!r} meant?")
-    for key in sorted(UNSUPPORTED & content.keys()):
+    for key in sorted(UNSUPPORTED.keys() & content.keys()):
         if content[key] not in (0, 0.0, None, [], False):
-            raise DatasetError(f"{file}: {where}{key} is {content[key]!r}, which is not supported; {_UNSUPPORTED_HOW}")
+            raise DatasetError(f"{file}: {where}{key} is {content[key]!r}, which is not supported; {UNSUPPORTED[key]}")
 
 
 def find_image(root: Path, file_path: str) -> Path | None:
@@ -104,7 +98,10 @@ def find_image(root: Path, file_path: str) -> Path | None:
     """
     parts = PurePosixPath(file_path.replace("\\", "/")).parts
     for first in range(len(parts)):
-        found = _image_at(root.joinpath(*parts[first:]))
+        try:
+            found = _image_at(root.joinpath(*parts[first:]))
+        except (OSError, ValueError):  # no name that a file can have, as one that is empty or too long
+            continue
         if found is not None:
             return found
     return None
@@ -144,20 +141,6 @@ def check_distinct(file: Path | str, records: Sequence[ImageRecord]) -> None:
         if record.name in seen:
             raise DatasetError(f"{file}: {record.name} is listed twice; take one of its frames out")
         seen.add(record.name)
-
-
-def checked_rigid(object_from_cam: np.ndarray, where: str) -> np.ndarray:
-    """The rigid transform that a stored matrix is, its rounding removed. DatasetError if it is not nearly one."""
-    if not np.all(np.isfinite(object_from_cam)):
-        raise DatasetError(f"{where}: the pose has a number that is not finite; take the image out or pose it again")
-    if not is_rigid(object_from_cam, RIGID_TOLERANCE):
-        scale = np.linalg.norm(object_from_cam[:3, :3], axis=0)
-        determinant = np.linalg.det(object_from_cam[:3, :3])
-        raise DatasetError(
-            f"{where}: the pose is not rigid (column lengths {np.round(scale, 4).tolist()}, determinant"
-            f" {determinant:.4g}, last row {object_from_cam[3].tolist()}); export rigid poses"
-        )
-    return nearest_rigid(object_from_cam)
 
 
 def relative_name(root: Path, path: Path) -> str:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from fieldpose.errors import DatasetError, GeometryError
 from fieldpose.stages.geometry.cameras import Camera
-from fieldpose.stages.nerf.datasets.images import ImageHeader
+from fieldpose.stages.nerf.datasets.images import ImageHeader, probe
 
+_ASPECT_TOLERANCE = 0.01
 _NARROWEST_DEG, _WIDEST_DEG = 1.0, 170.0
 """Of a photograph: the longest tele lenses see 2 degrees, and a pinhole camera's images are useless beyond 150."""
 PINHOLE_MODELS = ("PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "PERSPECTIVE")
@@ -51,13 +53,43 @@ def camera_of(document: Intrinsics, frame: Intrinsics, header: ImageHeader, pixe
     cx = header.width / 2 - 0.5 if cx is None else cx - pixel_centre
     cy = header.height / 2 - 0.5 if cy is None else cy - pixel_centre
     k1, k2, p1, p2, k3 = (_stated(document, frame, name) or 0.0 for name in ("k1", "k2", "p1", "p2", "k3"))
+    return checked_camera(where, header.width, header.height, (fx, fy), (cx, cy), (k1, k2, p1, p2, k3))
+
+
+def checked_camera(
+    where: str,
+    width: int,
+    height: int,
+    focal: tuple[float, float],
+    principal: tuple[float, float],
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0),
+) -> Camera:
+    """A camera of photographs; (0, 0) is the centre of the first pixel. DatasetError if the numbers make none."""
     try:
-        camera = Camera(header.width, header.height, fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+        camera = Camera(width, height, *focal, *principal, distortion)
         check_invertible(camera)
         _check_field_of_view(camera)
     except GeometryError as error:
         raise DatasetError(f"{where}: {error}") from error
     return camera
+
+
+def fitted(path: Path, camera: Camera) -> Camera:
+    """The camera at the size of an image's file, which may have been shrunk since. DatasetError for another shape."""
+    header = probe(path)
+    if (header.width, header.height) == (camera.width, camera.height):
+        return camera
+    if not same_shape(header, camera.width, camera.height):
+        raise DatasetError(
+            f"{path}: the image has {header.width}x{header.height} pixels, its camera {camera.width}x{camera.height},"
+            " another shape; restore the images that the camera is of"
+        )
+    return camera.resized(header.width, header.height)
+
+
+def same_shape(header: ImageHeader, width: int, height: int) -> bool:
+    """Whether an image is one of (width, height) resized, but for the rounding of its sides."""
+    return abs(width * header.height - height * header.width) <= _ASPECT_TOLERANCE * width * header.height
 
 
 def _stated(document: Intrinsics, frame: Intrinsics, name: str) -> float | None:
@@ -107,4 +139,6 @@ def check_invertible(camera: Camera) -> None:
     """GeometryError for a lens that folds its image's corners over it."""
     if camera.is_distorted:
         right, bottom = camera.width - 0.5, camera.height - 0.5
-        camera.directions(np.array([(-0.5, -0.5), (right, -0.5), (-0.5, bottom), (right, bottom)]))
+        corners = np.array([(-0.5, -0.5), (right, -0.5), (-0.5, bottom), (right, bottom)])
+        with np.errstate(over="ignore", invalid="ignore"):
+            camera.directions(corners)

@@ -12,8 +12,9 @@ from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry.cameras import Camera
 from fieldpose.stages.geometry.rigid import from_rotation, inverse
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
-from fieldpose.stages.nerf.datasets.frames import OPENCV_FROM_OPENGL, checked_rigid, relative_name
+from fieldpose.stages.nerf.datasets.frames import OPENCV_FROM_OPENGL, relative_name
 from fieldpose.stages.nerf.datasets.images import is_image_name, probe
+from fieldpose.stages.nerf.datasets.parsing import checked_rigid
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 FILE = "poses_bounds.npy"

@@ -18,7 +18,7 @@ from fieldpose.stages.geometry import Camera, Similarity
 from fieldpose.stages.nerf.datasets import images
 from fieldpose.stages.nerf.datasets.bounds import SceneBounds
 
-Kind = Literal["blender", "transforms", "llff", "colmap"]
+Kind = Literal["blender", "transforms", "llff", "colmap", "7scenes", "tum", "bop", "record3d", "polycam"]
 Scene = Literal["object", "bounded", "unbounded"]
 
 

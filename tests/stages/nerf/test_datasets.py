@@ -8,23 +8,10 @@ from support import posed_images as made
 
 from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry import camera_centre, inverse, is_rigid, look_at, rotation_error_deg, translation_error
-from fieldpose.stages.nerf.datasets import Dataset, find_name, load_dataset
+from fieldpose.stages.nerf.datasets import find_name, load_dataset
 
 SQUARE = made.centred(80, 80, 95.0)
 WIDE = made.centred(192, 128, 200.0)
-
-
-def worst_dot_px(dataset: Dataset, point: np.ndarray = made.POINT) -> float:
-    """How far from its projection the point is in the loaded images, at most."""
-    return max(
-        float(np.linalg.norm(made.dot_in(image) - made.seen_at(record.camera, record.cam_from_object, point)))
-        for image, record in zip(dataset.load_images(), dataset.images, strict=True)
-    )
-
-
-def assert_poses(dataset: Dataset, poses: list[np.ndarray]) -> None:
-    found = np.stack([record.cam_from_object for record in dataset.images])
-    np.testing.assert_allclose(found, np.stack(poses), atol=1e-6)
 
 
 def test_blender(tmp_path: Path) -> None:
@@ -32,12 +19,12 @@ def test_blender(tmp_path: Path) -> None:
     train, test = load_dataset(tmp_path), load_dataset(tmp_path, "test")
     assert (train.kind, train.scene, train.background, train.has_alpha) == ("blender", "object", (255, 255, 255), True)
     assert [record.name for record in train.images] == [f"train/r_{i}.png" for i in range(6)]
-    assert_poses(train, poses[:6])
-    assert_poses(test, poses[6:])
-    assert_poses(load_dataset(tmp_path, "all"), poses)
+    made.assert_poses(train, poses[:6])
+    made.assert_poses(test, poses[6:])
+    made.assert_poses(load_dataset(tmp_path, "all"), poses)
     assert train.images[0].camera == SQUARE
     assert train.load_image(0).shape == (80, 80, 4)
-    assert worst_dot_px(train) < 0.1
+    assert made.worst_dot_px(train) < 0.1
     assert not train.notes
 
 
@@ -46,8 +33,8 @@ def test_images_and_cameras_shrink_together(tmp_path: Path, size: int) -> None:
     made.write_blender(tmp_path, WIDE)
     dataset = load_dataset(tmp_path, size=size)
     assert dataset.load_image(0).shape == (round(size * 128 / 192), size, 4)
-    assert worst_dot_px(dataset) < 0.1
-    assert worst_dot_px(load_dataset(tmp_path).resized(size)) < 0.1
+    assert made.worst_dot_px(dataset) < 0.1
+    assert made.worst_dot_px(load_dataset(tmp_path).resized(size)) < 0.1
     assert [image.shape for image in load_dataset(tmp_path).load_images(size)] == [dataset.load_image(0).shape] * 6
 
 
@@ -88,7 +75,7 @@ def test_scene_with_a_box_and_ground_truth(tmp_path: Path) -> None:
     np.testing.assert_allclose(dataset.load_depth(0), depth * 0.001, rtol=1e-6)
     assert dataset.load_mask(0).dtype == bool
     assert dataset.load_mask(0).sum() == 40 * 64
-    assert worst_dot_px(dataset) < 0.1
+    assert made.worst_dot_px(dataset) < 0.1
     half = dataset.resized(48)
     assert half.load_depth(0).shape == half.load_mask(0).shape == (32, 48)
     assert set(np.unique(half.load_depth(0))) <= set(np.unique(dataset.load_depth(0)))
@@ -135,26 +122,26 @@ def test_exif_orientation_is_ignored_as_by_colmap(tmp_path: Path) -> None:
     exif[0x0112] = 6
     with Image.open(tmp_path / "images/0000.png") as image:
         image.convert("RGB").save(tmp_path / "images/0000.png", exif=exif)
-    assert worst_dot_px(load_dataset(tmp_path)) < 0.1
+    assert made.worst_dot_px(load_dataset(tmp_path)) < 0.1
 
 
 def test_transforms(tmp_path: Path) -> None:
     poses = made.write_transforms(tmp_path, made.DISTORTED)
     train, test = load_dataset(tmp_path, "train"), load_dataset(tmp_path, "test")
     assert (train.kind, train.scene, train.background) == ("transforms", "unbounded", None)
-    assert_poses(train, poses[0::2])
-    assert_poses(test, poses[1::2])
+    made.assert_poses(train, poses[0::2])
+    made.assert_poses(test, poses[1::2])
     np.testing.assert_allclose(train.images[0].camera.matrix(), made.DISTORTED.matrix())
     assert train.images[0].camera.distortion == made.DISTORTED.distortion
-    assert worst_dot_px(load_dataset(tmp_path, "all")) < 0.1
-    assert worst_dot_px(load_dataset(tmp_path, "all", size=48)) < 0.1
+    assert made.worst_dot_px(load_dataset(tmp_path, "all")) < 0.1
+    assert made.worst_dot_px(load_dataset(tmp_path, "all", size=48)) < 0.1
 
 
 def test_holdout(tmp_path: Path) -> None:
     poses = made.write_transforms(tmp_path, made.CAMERA, count=10)
-    assert_poses(load_dataset(tmp_path, "test", holdout="every8"), [poses[0], poses[8]])
-    assert_poses(load_dataset(tmp_path, "test", holdout="odd"), poses[1::2])
-    assert_poses(load_dataset(tmp_path, "train", holdout=None), poses)
+    made.assert_poses(load_dataset(tmp_path, "test", holdout="every8"), [poses[0], poses[8]])
+    made.assert_poses(load_dataset(tmp_path, "test", holdout="odd"), poses[1::2])
+    made.assert_poses(load_dataset(tmp_path, "train", holdout=None), poses)
     with pytest.raises(DatasetError, match="the test split is empty"):
         load_dataset(tmp_path, "test", holdout=None)
 
@@ -163,7 +150,7 @@ def test_transforms_are_sorted_by_file_name(tmp_path: Path) -> None:
     poses = made.write_transforms(tmp_path, made.CAMERA)
     file = tmp_path / "transforms.json"
     made.edit_json(file, frames=json.loads(file.read_text())["frames"][::-1])
-    assert_poses(load_dataset(tmp_path, "all"), poses)
+    made.assert_poses(load_dataset(tmp_path, "all"), poses)
 
 
 def test_transforms_spellings(tmp_path: Path) -> None:
@@ -175,7 +162,7 @@ def test_transforms_spellings(tmp_path: Path) -> None:
     made.edit_frame(file, 1, file_path="images\\0001.png", colmap_im_id=2)
     made.edit_frame(file, 2, transform_matrix=made.opengl(poses[2])[:3])
     dataset = load_dataset(tmp_path, "all")
-    assert_poses(dataset, poses)
+    made.assert_poses(dataset, poses)
     assert [record.name for record in dataset.images[:2]] == ["images/0000.png", "images/0001.png"]
 
 
@@ -186,7 +173,7 @@ def test_each_frame_may_have_its_own_intrinsics(tmp_path: Path) -> None:
     made.edit_frame(tmp_path / "transforms.json", 1, **made.intrinsics(own), camera_model="PINHOLE")
     dataset = load_dataset(tmp_path, "all")
     assert [record.camera for record in dataset.images[:2]] == [made.CAMERA, own]
-    assert worst_dot_px(dataset) < 0.1
+    assert made.worst_dot_px(dataset) < 0.1
 
 
 def test_a_frames_angle_goes_before_the_files_focal_length(tmp_path: Path) -> None:
@@ -202,7 +189,7 @@ def test_angles_alone_are_enough(tmp_path: Path) -> None:
     frames = json.loads(file.read_text())["frames"]
     made.write_json(file, {"camera_angle_x": 2 * np.arctan(192 / 400), "frames": frames})
     assert load_dataset(tmp_path).images[0].camera.matrix() == pytest.approx(WIDE.matrix())
-    assert worst_dot_px(load_dataset(tmp_path)) < 0.1
+    assert made.worst_dot_px(load_dataset(tmp_path)) < 0.1
 
 
 @pytest.mark.parametrize("held_out", ["test_filenames", "val_filenames"])
@@ -210,9 +197,9 @@ def test_splits_that_the_file_names(tmp_path: Path, held_out: str) -> None:
     poses = made.write_transforms(tmp_path, made.CAMERA)
     names = [f"./images/{i:04d}.png" for i in range(7)]
     made.edit_json(tmp_path / "transforms.json", train_filenames=names[:4], **{held_out: names[4:6]})
-    assert_poses(load_dataset(tmp_path, "train"), poses[:4])
-    assert_poses(load_dataset(tmp_path, "test"), poses[4:6])
-    assert_poses(load_dataset(tmp_path, "all"), poses[:6])
+    made.assert_poses(load_dataset(tmp_path, "train"), poses[:4])
+    made.assert_poses(load_dataset(tmp_path, "test"), poses[4:6])
+    made.assert_poses(load_dataset(tmp_path, "all"), poses[:6])
 
 
 def test_blurred_frames_that_were_deleted_are_left_out_with_a_note(tmp_path: Path) -> None:
@@ -221,7 +208,7 @@ def test_blurred_frames_that_were_deleted_are_left_out_with_a_note(tmp_path: Pat
         made.edit_frame(tmp_path / "transforms.json", i, sharpness=20.0 + i)
     (tmp_path / "images/0002.png").unlink()
     dataset = load_dataset(tmp_path, "test")
-    assert_poses(dataset, [poses[1], poses[4], poses[6]])
+    made.assert_poses(dataset, [poses[1], poses[4], poses[6]])
     assert dataset.notes == ("transforms.json: 1 of 7 frames have no image and are left out: images/0002.png",)
 
 
@@ -229,11 +216,11 @@ def test_llff_as_stored(tmp_path: Path) -> None:
     poses = made.write_llff(tmp_path, WIDE)
     dataset = load_dataset(tmp_path, "all", llff_normalise=False)
     assert (dataset.kind, dataset.scene, dataset.scale) == ("llff", "unbounded", 1.0)
-    assert_poses(dataset, poses)
+    made.assert_poses(dataset, poses)
     assert dataset.images[0].camera == WIDE
     assert {(record.near, record.far) for record in dataset.images} == {(3.0, 30.0)}
-    assert worst_dot_px(dataset) < 0.1
-    assert_poses(load_dataset(tmp_path, "test", llff_normalise=False), [poses[0], poses[8]])
+    assert made.worst_dot_px(dataset) < 0.1
+    made.assert_poses(load_dataset(tmp_path, "test", llff_normalise=False), [poses[0], poses[8]])
 
 
 def test_llff_normalised_is_the_same_scene_seen_from_the_average_camera(tmp_path: Path) -> None:
@@ -253,7 +240,7 @@ def test_llff_normalised_is_the_same_scene_seen_from_the_average_camera(tmp_path
         assert translation_error(found[0], found[i]) == pytest.approx(scaled)
     in_cam = poses[0] @ [*made.POINT, 1]
     in_cam[:3] *= dataset.scale
-    assert worst_dot_px(dataset, (inverse(found[0]) @ in_cam)[:3]) < 0.1
+    assert made.worst_dot_px(dataset, (inverse(found[0]) @ in_cam)[:3]) < 0.1
 
 
 def test_llff_takes_the_folder_that_suits_the_size(tmp_path: Path) -> None:
@@ -269,7 +256,7 @@ def test_llff_takes_the_folder_that_suits_the_size(tmp_path: Path) -> None:
     assert folder_and_width(size=90) == ("images_2", 90)
     assert folder_and_width(size=500) == ("images", 192)
     dataset = load_dataset(tmp_path, size=90, llff_normalise=False)
-    assert worst_dot_px(dataset) < 0.1
+    assert made.worst_dot_px(dataset) < 0.1
 
 
 def test_bounds_of_objects_and_scenes(tmp_path: Path) -> None:

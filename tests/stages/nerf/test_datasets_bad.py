@@ -84,7 +84,7 @@ BLENDER: dict[str, tuple[Break, str]] = {
         r"transforms_train\.json: not as expected .*frames",
     ),
     "not JSON": (lambda r: text(r / TRAIN, "{'frames': []"), r"transforms_train\.json: not valid JSON"),
-    "not text": (lambda r: (r / TRAIN).write_bytes(b"\xff\xfe\x00"), r"transforms_train\.json: not valid JSON"),
+    "not text": (lambda r: (r / TRAIN).write_bytes(b"\xff\xfe\x00"), r"train\.json: not readable as text"),
     "a list": (lambda r: text(r / TRAIN, "[]"), r"transforms_train\.json: not as expected"),
     "deep nesting": (lambda r: text(r / TRAIN, "[" * 100_000), r"transforms_train\.json: not valid JSON"),
     "no frames key": (without(TRAIN, "frames"), r"transforms_train\.json: not as expected .*frames"),
@@ -135,6 +135,10 @@ TRANSFORMS_JSON: dict[str, tuple[Break, str]] = {
     "fisheye flag": (whole(TRANSFORMS, is_fisheye=True), r"is_fisheye is not supported; undistort"),
     "fisheye coefficient": (whole(TRANSFORMS, k4=0.01), r"k4 belongs to a fisheye lens"),
     "NaN intrinsics": (whole(TRANSFORMS, cx=float("nan")), r"frame images/0000\.png: a camera needs finite"),
+    "lens of instant-ngp": (whole(TRANSFORMS, ftheta_p0=0.5), r"ftheta_p0 is 0\.5, .*; undistort the images"),
+    "panorama": (frame(TRANSFORMS, latlong=True), r"frame 1: latlong is True, which is not supported"),
+    "axes of Mitsuba": (whole(TRANSFORMS, from_mitsuba=True), r"from_mitsuba is True, .*; write poses in OpenGL's"),
+    "axes of another": (whole(TRANSFORMS, from_na=True), r"from_na is True, which is not supported; write poses in"),
     "negative focal length": (whole(TRANSFORMS, fl_y=-3.0), r"frame images/0000\.png: a camera needs .* positive"),
     "text as number": (whole(TRANSFORMS, fl_x="110"), r"transforms\.json: not as expected .*fl_x"),
     "folding distortion": (whole(TRANSFORMS, k1=-3.0), r"frame images/0000\.png: the distortion .* has no inverse"),
@@ -224,7 +228,7 @@ def test_all_images_deleted(tmp_path: Path) -> None:
 
 def test_folders_that_are_no_dataset(tmp_path: Path) -> None:
     assert_refused(
-        tmp_path, "not a dataset; expected transforms_train.json, transforms.json, poses_bounds.npy or a COLMAP model"
+        tmp_path, "not a dataset; expected transforms_train.json, transforms.json, poses_bounds.npy, a COLMAP model"
     )
     assert_refused(tmp_path / "nowhere", "no such folder")
     text(tmp_path / "file.json", "{}")

@@ -65,12 +65,16 @@ def test_keys_of_other_programs_are_theirs(tmp_path: Path) -> None:
     theirs = {
         "applied_transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "applied_scale": 2.0, "aabb_scale": 16,
         "scale": 0.5, "offset": [0, 0, 0], "ply_file_path": "sparse_pc.ply", "k5": 0,
-        "orientation_override": "none", "n_extra_learnable_dims": 0,
+        "orientation_override": "none", "n_extra_learnable_dims": 0, "from_na": False, "fix_premult": True,
+        "fisheye_crop_radius": 900, "panoptic_classes": "p.json",
     }  # fmt: skip
     made.edit_json(file, **theirs)
     made.edit_frame(file, 0, colmap_im_id=3, sharpness=12.0, normal_file_path="n.png", camera_id=1, camera_label="a")
     made.edit_json(file, n_frames=7)
-    assert len(load_dataset(tmp_path, "all")) == 7
+    dataset = load_dataset(tmp_path, "all")
+    assert not dataset.notes
+    # The poses are those after what was applied to them.
+    made.assert_poses(dataset, made.poses_around(7))
 
 
 def test_depth_without_a_scale_matters_only_where_depth_is_asked_for(tmp_path: Path) -> None:

@@ -15,13 +15,13 @@ from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.nerf.datasets.writing import transforms_document
 
 
-def write(root: Path, cameras: list[Camera], held_out: set[str]) -> tuple[list[str], list[np.ndarray]]:
+def write(root: Path, cameras: list[Camera], held_out: set[str] | None) -> tuple[list[str], list[np.ndarray]]:
     poses = made.poses_around(len(cameras))
     names = [f"images/{i:03d}.png" for i in range(len(cameras))]
     (root / "images").mkdir()
     for name, camera, pose in zip(names, cameras, poses, strict=True):
         Image.fromarray(made.picture(camera, pose)).save(root / name)
-    document = transforms_document(names, cameras, np.stack(poses), held_out, 0.25)
+    document = transforms_document(names, cameras, np.stack(poses), held_out, {"metres_per_unit": 0.25})
     (root / "transforms.json").write_text(json.dumps(document))
     return names, poses
 
@@ -42,6 +42,6 @@ def test_what_is_written_is_read(tmp_path: Path, lenses: list[Camera]) -> None:
         )
 
 
-def test_without_held_out_images_the_reader_splits(tmp_path: Path) -> None:
-    write(tmp_path, [made.CAMERA] * 4, set())
+def test_without_a_split_the_reader_splits(tmp_path: Path) -> None:
+    write(tmp_path, [made.CAMERA] * 4, None)
     assert [r.split for r in load_dataset(tmp_path, "all", holdout="odd").images] == ["train", "test", "train", "test"]

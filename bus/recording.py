@@ -200,7 +200,7 @@ def schema_of(message_type: type[Message]) -> bytes:
 def recover(path: Path | str, out: Path | str) -> int:
     """Write what can be saved of an unfinished or damaged recording as a whole one; return the number of messages.
 
-    Raises RecordingError where `path` does not begin as a recording, or nothing can be written.
+    Raises RecordingError where `path` does not begin as a recording, holds no message, or nothing can be written.
     """
     salvage = Salvage(path)
     writer = RecordingWriter(out)
@@ -209,6 +209,10 @@ def recover(path: Path | str, out: Path | str) -> int:
     except RecordingError:
         writer.discard()
         raise
+    if saved == 0:
+        writer.discard()
+        why = "" if salvage.damage is None else f" ({salvage.damage})"
+        raise RecordingError(f"{path}: no whole message is in it{why}; nothing was written")
     named = {name: values for name, values in salvage.metadata if name not in (SOURCE_RECORD, RECORDING_RECORD)}
     writer.add(named, salvage.attachments)
     writer.close(damage=salvage.damage)

@@ -8,13 +8,14 @@ import struct
 import threading
 import time
 from collections.abc import Container, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import mcap.exceptions
 from mcap import records
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.stream_reader import CRCValidationError, StreamReader
 from mcap.writer import MCAP0_MAGIC
@@ -29,6 +30,7 @@ from fieldpose.errors import CodecError, RecordingError
 SOURCE_RECORD = "fieldpose.source"
 RECORDING_RECORD = "fieldpose.recording"
 _RECORD_LIMIT = 1 << 30
+_RECORD_HEAD, _CHUNK_HEAD = 9, 32
 _DAMAGE = (
     mcap.exceptions.McapError, CRCValidationError, struct.error, EOFError, ValueError, KeyError, IndexError,
     OverflowError, MemoryError, StopIteration, RuntimeError,
@@ -198,19 +200,60 @@ class Salvage:
             with _open(self.path) as stream:
                 if os.fstat(stream.fileno()).st_size < len(MCAP0_MAGIC):
                     raise mcap.exceptions.InvalidMagic("too short")
-                for record in StreamReader(stream, validate_crcs=True, record_size_limit=_RECORD_LIMIT).records:
-                    if isinstance(record, records.Channel):
-                        channels[record.id] = record.topic
-                    elif isinstance(record, records.Message):
-                        yield Payload(channels[record.channel_id], record.data, record.log_time)
-                    elif isinstance(record, records.Metadata):
-                        self.metadata.append((record.name, record.metadata))
-                    elif isinstance(record, records.Attachment):
-                        self.attachments.append(Attachment(record.name, record.media_type, record.data))
+                yield from self._read(
+                    StreamReader(stream, validate_crcs=True, record_size_limit=_RECORD_LIMIT), channels
+                )
         except mcap.exceptions.InvalidMagic as error:
             raise RecordingError(f"{self.path}: is no recording (MCAP file)") from error
         except _DAMAGE as error:
             self.damage = str(error) or type(error).__name__
+        if self.damage is not None:
+            # What is whole within the chunk that the file ends in, which the reader gives as a whole or not at all.
+            with suppress(*_DAMAGE), _open(self.path) as stream:
+                inside = StreamReader(_ExactBytes(_cut_chunk(stream)), skip_magic=True, record_size_limit=_RECORD_LIMIT)
+                yield from self._read(inside, channels)
+
+    def _read(self, reader: StreamReader, channels: dict[int, str]) -> Iterator[Payload]:
+        for record in reader.records:
+            if isinstance(record, records.Channel):
+                channels[record.id] = record.topic
+            elif isinstance(record, records.Message):
+                yield Payload(channels[record.channel_id], record.data, record.log_time)
+            elif isinstance(record, records.Metadata):
+                self.metadata.append((record.name, record.metadata))
+            elif isinstance(record, records.Attachment):
+                self.attachments.append(Attachment(record.name, record.media_type, record.data))
+
+
+def _cut_chunk(stream: BinaryIO) -> bytes:
+    """The records in an uncompressed chunk that goes on beyond the end of the file; none where it ends elsewhere.
+
+    Source: MCAP's specification, of a record: opcode (1 byte), length (8), and of a chunk: two times and a size (8
+    each), a checksum (4), the compression's name with its length (4), the length of the records (8).
+    """
+    size = os.fstat(stream.fileno()).st_size
+    at = len(MCAP0_MAGIC)
+    while True:
+        stream.seek(at)
+        opcode, length = struct.unpack("<BQ", stream.read(_RECORD_HEAD))
+        if at + _RECORD_HEAD + length > size:
+            break
+        at += _RECORD_HEAD + length
+    if opcode != Opcode.CHUNK:
+        return b""
+    _, _, _, _, name = struct.unpack("<QQQLL", stream.read(_CHUNK_HEAD))
+    stream.read(8)
+    return b"" if name else stream.read(min(size - stream.tell(), _RECORD_LIMIT))
+
+
+class _ExactBytes(io.BytesIO):
+    """Refuses to read past the end."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data = super().read(size)
+        if size is not None and len(data) < size:
+            raise EOFError("the file ends within a record")
+        return data
 
 
 class _ExactReader(io.BufferedReader):

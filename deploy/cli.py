@@ -19,6 +19,7 @@ from fieldpose.errors import UsageError
 
 COMMANDS = {
     "demo": "the embedded scene through the whole pipeline",
+    "start": "a video or photographs -> tracking, in one command",
     "capture": "a video or photographs -> posed images to train on",
     "convert": "posed images of one kind as those of another, for other programs",
     "train": "posed images -> a field (.safetensors)",

@@ -15,9 +15,11 @@ import numpy as np
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
+from fieldpose.deploy.reporting.output import check_writable, progress_console, write_bytes, write_json
+from fieldpose.deploy.reporting.overlay import captioned, encoded
 from fieldpose.deploy.reporting.turntable import check_video, write_turntable
 from fieldpose.deploy.settings import overridden
+from fieldpose.errors import OutputError
 from fieldpose.stages.matching.core import MatchingConfig
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 
@@ -35,15 +37,16 @@ class Options:
     Example: fieldpose train ../shared/data/lego --size 400 --minutes 5 --out out/lego.safetensors
 
     The kind of dataset is recognised from its folder: Blender/NeRF-synthetic, transforms.json (instant-ngp,
-    nerfstudio), LLFF, a COLMAP model with its images, a scene of BOP (SCENE/obj_000005 where it has several objects),
-    7-Scenes, TUM RGB-D, or what Polycam and Record3D export. First its cameras are compared with the images, and
-    adjusted where they do not fit. Ctrl-C ends the training early and keeps what was learnt. In the end some of the
-    training images are looked for in the field, which tells how exact poses are to be expected, and whether the
-    dataset's own are in order. The JSON file has:
-    psnr_db (mean over the held-out views, null without any), psnr_db_by_view, accuracy (images, found, rotation_deg and
-    translation, medians, error_scale, how many times larger errors are than an image shows; null where too few were
-    found), cameras (verdict: fit, adjusted, too few or no fit; before_px, after_px, rotation_deg, translation,
-    focal_px, kept; null where they were taken as given), steps, seconds, interrupted, size_bytes.
+    nerfstudio), LLFF, a COLMAP model with its images, a scene of BOP (SCENE/obj_000005 where it has several
+    objects), 7-Scenes, TUM RGB-D, or what Polycam and Record3D export. First its cameras are compared with the
+    images, and adjusted where they do not fit. From the first fifth of the training on, a picture beside the field
+    (.jpg) shows a held-out image and what is learnt of it. Ctrl-C ends the training early and keeps what was
+    learnt. In the end some of the training images are looked for in the field, which tells how exact poses are to
+    be expected, and whether the dataset's own are in order. The JSON file has: psnr_db (mean over the held-out
+    views, null without any), psnr_db_by_view, accuracy (images, found, rotation_deg and translation, medians,
+    error_scale, how many times larger errors are than an image shows; null where too few were found), cameras
+    (verdict: fit, adjusted, too few or no fit; before_px, after_px, rotation_deg, translation, focal_px, kept; null
+    where they were taken as given), steps, seconds, interrupted, size_bytes.
     """
 
     dataset: tyro.conf.Positional[Path]
@@ -89,7 +92,7 @@ class Options:
         training = overridden(self.training, minutes=self.minutes, backend=self.backend)
         holdout = None if self.holdout == "none" else self.holdout
         began = time.monotonic()
-        with _progress_bar() as (report, looked):
+        with _progress_bar(self.out.with_suffix(".jpg")) as (report, looked):
             trained = learn_field(
                 self.dataset, self.out, self.size, holdout, training, self.model, self.matching, report, _say,
                 self.cameras, _say, looked, self.only,
@@ -146,8 +149,13 @@ def _quality(trained: TrainedField) -> str:
 
 
 @contextmanager
-def _progress_bar() -> Iterator[tuple[Callable[[TrainingReport], None], Callable[[str, float], None]]]:
-    """Gives functions that show on stderr, as lines where that is no terminal, a training and what comes before it."""
+def _progress_bar(
+    preview: Path,
+) -> Iterator[tuple[Callable[[TrainingReport], None], Callable[[str, float], None]]]:
+    """Gives functions that show on stderr, as lines where that is no terminal, a training and what comes before it.
+
+    preview: where a picture of what is learnt is written whenever there is a new one.
+    """
     console = progress_console()
     columns = (TextColumn("{task.fields[doing]}"), BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
@@ -164,12 +172,23 @@ def _progress_bar() -> Iterator[tuple[Callable[[TrainingReport], None], Callable
         def report(state: TrainingReport) -> None:
             nonlocal next_line
             text = _step_in_words(state)
+            if state.preview is not None:
+                _write_preview(state.preview, state.progress.seconds, preview)
             bar.update(task, completed=state.progress.fraction, description=text, doing="training")
             if not console.is_terminal and state.progress.seconds >= next_line:
                 next_line = state.progress.seconds + _LINE_EVERY_S
                 console.print(f"training: {state.progress.fraction:.0%}, {text}", highlight=False)
 
         yield report, looked
+
+
+def _write_preview(beside: np.ndarray, seconds: float, path: Path) -> None:
+    picture = captioned(beside, [f"held-out image, and as learnt after {seconds:.0f} s"])
+    try:
+        write_bytes(path, encoded(picture, path))
+    except OutputError as error:
+        # No reason to lose what is learnt.
+        _say(f"no picture of what is learnt: {error}")
 
 
 def _step_in_words(state: TrainingReport) -> str:

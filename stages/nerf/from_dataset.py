@@ -47,10 +47,14 @@ PRUNING_VIEWS, PRUNING_MAY_COST_DB = 16, 0.02
 
 @dataclass(frozen=True)
 class TrainingReport:
-    """What the progress display shows: see Progress; `validation_psnr_db` is None until it was first measured."""
+    """What the progress display shows: see Progress; `validation_psnr_db` is None until it was first measured.
+
+    preview: a held-out image beside what the field shows in its place, (h, 2 w, 3) uint8, where both are new.
+    """
 
     progress: Progress
     validation_psnr_db: float | None
+    preview: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -302,7 +306,7 @@ def held_out_views(
 
 
 class _Monitor:
-    """Passes progress on at most a few times a second, and renders held-out views at each tenth of the time."""
+    """Passes progress on at most a few times a second, and renders held-out views at each fifth of the training."""
 
     def __init__(
         self,
@@ -316,11 +320,20 @@ class _Monitor:
         self._next_time, self._next_fraction = 0.0, 0.2
 
     def __call__(self, progress: Progress) -> None:
+        preview = None
         if self._views and progress.fraction >= self._next_fraction:
             self._next_fraction += 0.2
             renderer = NumbaRenderer(self._trainer.field(self._metadata), self._trainer.config.threads)
             self._psnr = float(np.mean(evaluate(renderer, self._views, VALIDATION_STRIDE)))
+            preview = _beside(self._views[0], renderer)
             renderer.close()
-        if progress.seconds >= self._next_time:
+        if preview is not None or progress.seconds >= self._next_time:
             self._next_time = progress.seconds + REPORT_EVERY_S
-            self._report(TrainingReport(progress, self._psnr))
+            self._report(TrainingReport(progress, self._psnr, preview))
+
+
+def _beside(view: View, renderer: NumbaRenderer) -> np.ndarray:
+    """An image and what is learnt of it, (h, 2 w, 3) uint8."""
+    red, green, blue = (round(255 * value) for value in renderer.metadata.background)
+    photo = over_background(view.image, (red, green, blue))
+    return np.hstack([photo, renderer.render_view(view.camera.undistorted(), view.cam_from_object).rgb])

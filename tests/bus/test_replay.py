@@ -120,6 +120,38 @@ class TestDamage:
         assert not facts.lossless
         assert facts.metadata["config"] == {"a": "b"}
 
+    @settings(derandomize=True, deadline=None, max_examples=25)
+    @given(st.integers(1, 99))
+    def test_whole_messages_of_the_chunk_that_is_cut_are_saved(
+        self, tmp_path_factory: pytest.TempPathFactory, share: int
+    ) -> None:
+        """All 25 messages are in one chunk, which the reader alone would give as a whole or not at all."""
+        folder = tmp_path_factory.mktemp("cut")
+        whole = RecordingWriter(folder / "whole.mcap")
+        for frame_id in range(25):
+            whole.write(ADDRESS.key(FRAME), FRAME, frame(frame_id, width=80, height=60), frame_id)
+        whole.close()
+        data = (folder / "whole.mcap").read_bytes()
+        size = 80 * 60 * 3
+        cut = folder / "cut.mcap"
+        cut.write_bytes(data[: len(data) * share // 100])
+        most = len(data) * share // 100 // size
+        if most < 2:
+            with suppress(RecordingError):
+                recover(cut, folder / "saved.mcap")
+            return
+        saved = recover(cut, folder / "saved.mcap")
+        assert most - 2 <= saved <= min(most, 25)
+        ids = [each.message.header.frame_id for each in read_recording(folder / "saved.mcap")]
+        assert ids == list(range(saved))
+
+    def test_where_nothing_is_whole_nothing_is_written(self, recording: Path, tmp_path: Path) -> None:
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(recording.read_bytes()[:120])
+        with pytest.raises(RecordingError, match="no whole message is in it"):
+            recover(cut, tmp_path / "saved.mcap")
+        assert {path.name for path in tmp_path.iterdir() if "saved" in path.name} == set()
+
     def test_recovering_a_whole_file_loses_nothing(self, recording: Path, tmp_path: Path) -> None:
         assert recover(recording, tmp_path / "copy.mcap") == 13
         facts, copy = info(recording), info(tmp_path / "copy.mcap")

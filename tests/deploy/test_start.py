@@ -1,0 +1,83 @@
+"""`fieldpose start`: from a video to poses in one command, which goes on where it was ended."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.commands import fieldpose
+from support.papered_room import photograph
+
+from fieldpose.deploy.cli import main
+from fieldpose.stages.geometry import Camera, look_at
+
+LENS = Camera(480, 360, 400.0, 400.0, 239.5, 179.5)
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("video") / "walk.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (LENS.width, LENS.height))  # type: ignore[attr-defined]
+    for along in np.linspace(-1.0, 1.0, 36):
+        eye = (-0.6 + 0.5 * np.cos(along), 0.8 * along, 0.2 * np.sin(3 * along))
+        picture = photograph(LENS, look_at(eye, (1.8, 1.0, -0.2), (0, 0, 1)))
+        writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+    writer.release()
+    return path
+
+
+def test_a_video_becomes_poses_and_what_is_there_is_not_done_again(video: Path, tmp_path: Path) -> None:
+    out, told = tmp_path / "room", tmp_path / "told.json"
+    given = ("start", video, "--out", out, "--minutes", "0.1", "--json", told)
+    first = fieldpose(*given, cwd=tmp_path, timeout_s=240)
+    assert first.returncode == 0, first.stderr
+    steps = json.loads(told.read_text())["steps"]
+    assert [step["step"] for step in steps] == ["capture", "train"]
+    assert all(step["seconds"] > 0 and step["peak_mb"] > 50 for step in steps)
+    assert {"dataset", "field.safetensors", "field.mp4", "field.jpg", "start.json"} <= {p.name for p in out.iterdir()}
+    assert "next: the same command with --on" in first.stdout
+    learnt = (out / "field.safetensors").stat().st_mtime_ns
+    second = fieldpose(*given, "--on", video, cwd=tmp_path, timeout_s=240)
+    assert second.returncode == 0, second.stderr
+    steps = json.loads(told.read_text())["steps"]
+    assert [(step["step"], step["seconds"] is None) for step in steps] == [
+        ("capture", True), ("train", True), ("run", False)
+    ]  # fmt: skip
+    assert (out / "field.safetensors").stat().st_mtime_ns == learnt
+    rows = list(csv.DictReader((out / "poses.csv").read_text().splitlines()))
+    assert len(rows) == 36
+    assert {"run.json", "timeline.png"} <= {p.name for p in out.iterdir()}
+    other = fieldpose("start", video, "--out", out, "--marker", "0.1", cwd=tmp_path)
+    assert other.returncode == 2
+    assert "holds what was captured of another source, or with another marker" in other.stderr
+
+
+def test_a_capture_that_failed_is_done_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What a failed capture left is taken away, and nothing else."""
+    source, out = tmp_path / "photos", tmp_path / "out"
+    source.mkdir()
+    cv2.imwrite(str(source / "a.png"), np.zeros((40, 40, 3), np.uint8))
+    for _ in range(2):
+        assert main(["start", str(source), "--out", str(out)]) == 2
+        assert "usable images" in capsys.readouterr().err
+        (out / "dataset").mkdir(exist_ok=True)
+        (out / "dataset" / "left.jpg").write_bytes(b"")
+    assert not (out / "dataset" / "transforms.json").exists()
+
+
+def test_folders_of_others_are_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "mine"
+    out.mkdir()
+    (out / "precious.txt").write_text("mine")
+    assert main(["start", "nothing.mp4", "--out", str(out)]) == 2
+    assert "not made by `fieldpose start`" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["precious.txt"]
+    assert main(["start", "nothing.mp4", "--out", str(tmp_path / "new"), "--minutes", "0"]) == 2
+    assert "must be more than 0" in capsys.readouterr().err
+    assert main(["start", "nothing.mp4", "--out", str(tmp_path / "new"), "--on", "no.mp4"]) == 2
+    assert "no such file" in capsys.readouterr().err
+    assert not (tmp_path / "new" / "dataset").exists()

@@ -7,21 +7,16 @@ import shutil
 import socket
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
-import cv2
-import numpy as np
 import psutil
 
 from fieldpose.errors import FieldposeError
 from fieldpose.stages.cores import usable_cores
-
-if TYPE_CHECKING:
-    from fieldpose.stages.nerf.datasets import Dataset
 
 _PACKAGES = ("torch", "kornia", "numba", "numpy", "opencv-python-headless", "eclipse-zenoh", "mcap", "supervisor")
 _SHARED_MEMORY = Path("/dev/shm")
@@ -31,7 +26,6 @@ _DEFAULT_PORT = 7447
 _ECHOES = 20
 _ECHO_BYTES = 1 << 20
 _SLOW_ECHO_MS = 20.0
-_NAMED = 5
 Status = Literal["ok", "note", "warning", "failed"]
 
 
@@ -171,63 +165,6 @@ def field(path: Path) -> Iterator[Finding]:
     if found.descriptors is None:
         told = "it does not remember how its training views look: searches take longer, and estimate needs a guess"
         yield Finding("field", "note", told, "train it again")
-
-
-def dataset(path: Path) -> Iterator[Finding]:
-    """Whether a dataset can be read, every image of it, and its cameras fit what the images show."""
-    from fieldpose.stages.nerf.datasets import load_dataset
-    from fieldpose.stages.structure.selection import sharpness
-
-    try:
-        found = load_dataset(path, "all")
-        sharp = [sharpness(cv2.cvtColor(found.load_rgb(i), cv2.COLOR_RGB2GRAY)) for i in range(len(found))]
-    except FieldposeError as error:
-        yield Finding("dataset", "failed", str(error))
-        return
-    test = sum(record.split == "test" for record in found.images)
-    yield Finding(
-        "dataset", "ok", f"{path}: {found.kind}, {found.scene}, {len(found) - test} train, {test} test images"
-    )
-    yield from (Finding("dataset", "note", note) for note in found.notes)
-    yield from _images(found, np.array(sharp))
-    yield from _cameras(found)
-
-
-def _images(found: Dataset, sharp: np.ndarray) -> Iterator[Finding]:
-    from fieldpose.stages.nerf.datasets.images import orientation
-    from fieldpose.stages.nerf.from_dataset import FEW
-    from fieldpose.stages.structure.selection import BLURRED
-
-    names = [record.name for record in found.images]
-    if len(names) - sum(record.split == "test" for record in found.images) < FEW:
-        yield Finding("images", "warning", "few to learn from", "take more, from more sides")
-    blurred = [name for name, low in zip(names, sharp < BLURRED * np.median(sharp), strict=True) if low]
-    if blurred:
-        yield Finding(
-            "images", "note", f"much less sharp than the others: {_listed(blurred)}", "leave them out if blurred"
-        )
-    turned = [record.name for record in found.images if orientation(record.path) != 1]
-    if turned:
-        yield Finding(
-            "images", "note", f"turned by their EXIF orientation: {_listed(turned)}",
-            "poses are taken to be of the pixels as they are stored, as COLMAP has them",
-        )  # fmt: skip
-
-
-def _cameras(found: Dataset) -> Iterator[Finding]:
-    from fieldpose.deploy.cameras import fit_cameras, in_words, kept_in_words
-
-    fit = fit_cameras(found, "auto").fit
-    status: dict[str, Status] = {"fit": "ok", "adjusted": "note", "too few": "note", "no fit": "warning"}
-    wrong = fit.reading is not None
-    yield Finding("cameras", "warning" if wrong else status[fit.verdict], in_words(fit, found.unit))
-    kept = kept_in_words(fit)
-    if kept is not None:
-        yield Finding("cameras", "note", kept)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
 
 
 def _round_trips_ms() -> list[float]:

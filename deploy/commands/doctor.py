@@ -54,7 +54,10 @@ class Options:
         if self.field is not None:
             yield partial(checks.field, self.field)
         if self.dataset is not None:
-            yield partial(checks.dataset, self.dataset)
+            # It brings what structure is found by, which takes a second.
+            from fieldpose.deploy.dataset_checks import dataset
+
+            yield partial(dataset, self.dataset)
 
 
 def _print(finding: Finding, console: Console) -> None:

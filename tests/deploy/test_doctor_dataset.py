@@ -11,7 +11,8 @@ from PIL import Image
 from support import posed_images
 from support.papered_room import cameras_before_a_wall, photograph
 
-from fieldpose.deploy import checks
+from fieldpose.deploy.checks import Finding
+from fieldpose.deploy.dataset_checks import dataset, share_looking_away, size_of_intrinsics
 from fieldpose.stages.geometry import Camera, inverse
 
 CAMERA = Camera(400, 300, 280.0, 280.0, 199.5, 149.5)
@@ -23,19 +24,24 @@ def images() -> list[np.ndarray]:
     return [photograph(CAMERA, pose) for pose in TRUTH.cam_from_object]
 
 
-def written(root: Path, images: list[np.ndarray], opencv_axes: bool = False) -> Path:
+def written(
+    root: Path, images: list[np.ndarray], opencv_axes: bool = False, camera: Camera = CAMERA, scale: float = 1.0,
+    **about: float,
+) -> Path:  # fmt: skip
     frames = []
     for i, (pose, image) in enumerate(zip(TRUTH.cam_from_object, images, strict=True)):
         posed_images.save(root / f"images/{i:02d}.png", image)
-        matrix = inverse(pose).tolist() if opencv_axes else posed_images.opengl(pose)
+        placed = pose.copy()
+        placed[:3, 3] *= scale
+        matrix = inverse(placed).tolist() if opencv_axes else posed_images.opengl(placed)
         frames.append({"file_path": f"images/{i:02d}.png", "transform_matrix": matrix})
-    posed_images.write_json(root / "transforms.json", posed_images.intrinsics(CAMERA) | {"frames": frames})
+    posed_images.write_json(root / "transforms.json", posed_images.intrinsics(camera) | about | {"frames": frames})
     return root
 
 
-def told(root: Path) -> dict[str, list[checks.Finding]]:
-    findings: dict[str, list[checks.Finding]] = {}
-    for finding in checks.dataset(root):
+def told(root: Path) -> dict[str, list[Finding]]:
+    findings: dict[str, list[Finding]] = {}
+    for finding in dataset(root):
         findings.setdefault(finding.what, []).append(finding)
     return findings
 
@@ -68,3 +74,35 @@ def test_blurred_turned_and_few_images_are_named(tmp_path: Path, images: list[np
     few = told(tmp_path / "few")["images"]
     assert few[0].status == "warning"
     assert few[0].detail == "few to learn from"
+
+
+def test_intrinsics_of_larger_images_are_named(tmp_path: Path, images: list[np.ndarray]) -> None:
+    larger = Camera(400, 300, 560.0, 560.0, 399.5, 299.5)
+    (finding,) = told(written(tmp_path, images, camera=larger))["lens"]
+    assert finding.status == "warning"
+    assert "of images 2 times as large, 800x600" in finding.detail
+
+
+@pytest.mark.parametrize(
+    ("cx", "cy", "times"), [(199.5, 149.5, None), (210.0, 140.0, None), (99.5, 74.5, 0.5), (99.5, 149.5, None)]
+)
+def test_crops_and_lenses_off_the_middle_are_not_taken_for_scaled(cx: float, cy: float, times: float | None) -> None:
+    assert size_of_intrinsics([Camera(400, 300, 280.0, 280.0, cx, cy)] * 3) == pytest.approx(times)
+
+
+def test_units_and_copies_are_named(tmp_path: Path, images: list[np.ndarray]) -> None:
+    findings = told(written(tmp_path / "mm", [images[0], *images[:-1]], scale=1000.0))
+    assert "metres_per_unit 0.001" in findings["places"][0].mend
+    assert "images/01.png (as images/00.png)" in findings["images"][0].detail
+    (finding,) = told(written(tmp_path / "km", images, scale=1000.0, metres_per_unit=1.0))["places"]
+    assert finding.status == "warning"
+    assert "places" not in told(written(tmp_path / "right", images, scale=1000.0, metres_per_unit=0.001))
+
+
+def test_cameras_that_look_away_are_counted() -> None:
+    around = np.stack(posed_images.poses_around(12))
+    assert share_looking_away(around) == 0
+    turned = around.copy()
+    turned[:4] = np.diag([-1.0, 1.0, -1.0, 1.0]) @ turned[:4]
+    assert share_looking_away(turned) == pytest.approx(4 / 12)
+    assert share_looking_away(TRUTH.cam_from_object) == 0

@@ -14,7 +14,7 @@ import numpy as np
 from fieldpose.deploy.reporting.boxes import boxed, sheet
 from fieldpose.deploy.reporting.output import write_bytes, write_json
 from fieldpose.deploy.reporting.overlay import encoded
-from fieldpose.deploy.shots import FILMED_S, Report, Shot, Shots, read_shots
+from fieldpose.deploy.shots import FILMED_S, IMAGES, MASKS, Report, Shot, Shots, read_shots
 from fieldpose.errors import DatasetError, GeometryError
 from fieldpose.stages.cores import usable_cores
 from fieldpose.stages.geometry import Camera, scale_pixels
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from fieldpose.stages.structure.mapping import Mapped
     from fieldpose.stages.structure.markers import Marker
 
-IMAGES = "images"
 CAMERA_FILE = "camera.json"
 OBJECT_PICTURE = "object.jpg"
 _PICTURES = 6
@@ -229,8 +228,9 @@ class Structure:
         small = self._small
 
         def found(shot: Shot) -> tuple[Keypoints, float]:
-            image = shrunk(shot.image(), max(small.width, small.height))
-            return find_keypoints(image, MOST_KEYPOINTS), sharpness(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+            image = shrunk(shot.cut_out(), max(small.width, small.height))
+            colours = np.ascontiguousarray(image[..., :3])
+            return find_keypoints(image, MOST_KEYPOINTS), sharpness(cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY))
 
         with ThreadPoolExecutor(self._threads) as pool:
             for keypoints, sharp in pool.map(found, self._shots.chosen):
@@ -300,7 +300,9 @@ def _write(
     cameras = [mapped.camera.resized(shot.width, shot.height) for shot in chosen]
     held_out = set(names[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY])
     for i, shot in enumerate(chosen):
-        write_bytes(out / IMAGES / shot.name, shot.jpeg)
+        write_bytes(out / IMAGES / shot.name, shot.file)
+        if shot.mask is not None:
+            write_bytes(out / MASKS / f"{Path(shot.name).stem}.png", shot.mask)
         report("writing the images", (i + 1) / len(chosen))
     box = object_box(object_from_map.of_points(mapped.points), poses)
     if box is not None:
@@ -311,7 +313,9 @@ def _write(
     about: dict[str, object] = {} if metres is None else {"metres_per_unit": metres}
     if box is not None:
         about["object_aabb"] = box.tolist()
-    write_json(out / FILE, transforms_document(names, cameras, poses, held_out or None, about))
+    masked = [None if shot.mask is None else f"{MASKS}/{Path(shot.name).stem}.png" for shot in chosen]
+    companions = [{} if mask is None else {"mask_path": mask} for mask in masked]
+    write_json(out / FILE, transforms_document(names, cameras, poses, held_out or None, about, companions))
     return Captured(
         len(chosen), len(shots.chosen), len(shots.blurred), shots.seen, structure.why_not(mapped), cameras[0],
         mapped.error_px * cameras[0].width / mapped.camera.width, standing.on_plane, metres,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,12 +18,25 @@ from fieldpose.stages.camera.core import Source
 from fieldpose.stages.camera.sources import is_video, open_source
 from fieldpose.stages.camera.sources.folder import natural
 from fieldpose.stages.images import decoded, shrunk
-from fieldpose.stages.nerf.datasets.images import EXTENSIONS, is_image_name, upright, upright_size
+from fieldpose.stages.nerf.datasets.images import (
+    EXTENSIONS,
+    is_image_name,
+    load_mask,
+    probe,
+    upright,
+    upright_alpha,
+    upright_size,
+)
+from fieldpose.stages.nerf.datasets.intrinsics import same_shape
+from fieldpose.stages.nerf.datasets.masks import FOLDER as MASKS
+from fieldpose.stages.nerf.datasets.masks import find_masks
 
 Report = Callable[[str, float], None]
 FILMED_S = 60.0
 """A live camera films for so long, if it is not told otherwise."""
+IMAGES = "images"
 _QUALITY = 95
+_OPAQUE, _TRANSPARENT = ".jpg", ".png"
 _WHOLE = 0.9
 """Of the frames that a video says it has: of fewer, a user is told."""
 _RAW = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw"}
@@ -31,18 +44,31 @@ _RAW = {".heic", ".heif", ".avif", ".dng", ".cr2", ".cr3", ".nef", ".arw"}
 
 @dataclass(frozen=True)
 class Shot:
-    """One image to find a camera for: its name in the dataset, the bytes of its upright JPEG file, and its size."""
+    """One image to find a camera for: its name in the dataset, the bytes of its upright file, and its size.
+
+    The file is a JPEG, or where the image has an alpha channel a PNG. mask: the bytes of a PNG file, white where the
+    object is, where a mask tells.
+    """
 
     name: str
-    jpeg: bytes
+    file: bytes
     width: int
     height: int
+    mask: bytes | None = None
 
     def image(self) -> np.ndarray:
         """Its pixels (h, w, 3) uint8."""
-        pixels = decoded("jpeg", np.frombuffer(self.jpeg, np.uint8), self.width, self.height)
+        pixels = decoded("jpeg", np.frombuffer(self.file, np.uint8), self.width, self.height)
         assert pixels is not None, "what was encoded here can be decoded"
         return pixels
+
+    def cut_out(self) -> np.ndarray:
+        """The same, with an alpha channel (h, w, 4) where it has one, or a mask."""
+        if self.mask is not None:
+            return np.dstack([self.image(), _decoded(self.mask)])
+        if self.name.endswith(_TRANSPARENT):
+            return np.dstack([self.image(), _decoded(self.file)[..., 3]])
+        return self.image()
 
 
 @dataclass(frozen=True)
@@ -90,15 +116,17 @@ def _photographs(folder: Path, size: int, report: Report) -> Shots:
     sizes: set[tuple[int, int]] = set()
     stems = Counter(path.stem for path in paths)
     portrait = 2 * sum(height > width for width, height in map(upright_size, paths)) > len(paths)
+    masks = _masks(folder, paths)
     for i, path in enumerate(paths):
-        image = upright(path)
+        image, (mask, alpha) = upright(path), masks(path)
         if (image.shape[0] > image.shape[1]) != portrait and image.shape[0] != image.shape[1]:
-            image = np.ascontiguousarray(np.rot90(image))
+            image = np.rot90(image)
+            mask, alpha = (None if part is None else np.rot90(part) for part in (mask, alpha))
         sizes.add((image.shape[1], image.shape[0]))
-        shot = _shot(f"{path.stem}.jpg" if stems[path.stem] == 1 else f"{path.name}.jpg", image, size)
-        if shot.jpeg in known:
+        shot = _shot(path.stem if stems[path.stem] == 1 else path.name, image, size, mask, alpha)
+        if shot.file in known:
             continue
-        known.add(shot.jpeg)
+        known.add(shot.file)
         shots.append(shot)
         focal = focal_length_from_exif(path, shot.width, shot.height)
         focals += [] if focal is None else [focal]
@@ -132,7 +160,7 @@ def _frames(source: Source, most: int, size: int, seconds: float, report: Report
             measured, filmed_s = meter(image), time.monotonic() - began
             sizes.add((image.shape[1], image.shape[0]))
             if chooser.wants(measured):
-                chooser.keep(measured, _shot(f"{chooser.seen - 1:05d}.jpg", image, size))
+                chooser.keep(measured, _shot(f"{chooser.seen - 1:05d}", image, size))
             if live and filmed_s >= seconds:
                 break
             share = filmed_s / seconds if live else chooser.seen / source.length if source.length else 0.0
@@ -156,7 +184,48 @@ def _images(source: Source) -> Iterator[np.ndarray]:
             yield image
 
 
-def _shot(name: str, image: np.ndarray, size: int) -> Shot:
-    image = shrunk(image, size)
-    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    return Shot(name, jpeg.tobytes(), image.shape[1], image.shape[0])
+def _masks(folder: Path, paths: Sequence[Path]) -> Callable[[Path], tuple[np.ndarray | None, np.ndarray | None]]:
+    """Gives of a photograph its mask, (h, w) uint8, where there is a folder of masks, else its alpha channel, if any.
+
+    The folder `masks` is in that of the photographs, or beside it where that is called images.
+    """
+    beside = folder.name == IMAGES and not (folder / MASKS).is_dir()
+    found = find_masks(folder.parent if beside else folder, paths)
+
+    def mask_of(path: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
+        if found is None:
+            return None, upright_alpha(path)
+        mask, (width, height) = probe(found[path]), upright_size(path)
+        if not same_shape(mask, width, height):
+            raise SourceError(
+                f"{found[path]}: the mask has {mask.width}x{mask.height} pixels, {path.name}, upright as its EXIF says,"
+                f" {width}x{height}, another shape; make it anew of the upright photograph"
+            )
+        return np.where(load_mask(found[path], width, height), 255, 0).astype(np.uint8), None
+
+    return mask_of
+
+
+def _shot(
+    name: str, image: np.ndarray, size: int, mask: np.ndarray | None = None, alpha: np.ndarray | None = None
+) -> Shot:  # fmt: skip
+    """name: without an extension. mask and alpha (h, w) uint8."""
+    image = shrunk(np.ascontiguousarray(image), size)
+    height, width = image.shape[:2]
+    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    if alpha is None:
+        _, file = cv2.imencode(_OPAQUE, bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    else:
+        small = cv2.resize(np.ascontiguousarray(alpha), (width, height), interpolation=cv2.INTER_AREA)
+        _, file = cv2.imencode(_TRANSPARENT, np.dstack([bgr, small]))
+    png = None
+    if mask is not None:
+        small = cv2.resize(np.ascontiguousarray(mask), (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
+        png = cv2.imencode(".png", small)[1].tobytes()
+    return Shot(f"{name}{_OPAQUE if alpha is None else _TRANSPARENT}", file.tobytes(), width, height, png)
+
+
+def _decoded(png: bytes) -> np.ndarray:
+    pixels = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert pixels is not None, "what was encoded here can be decoded"
+    return pixels

@@ -31,8 +31,10 @@ class Options:
     with a marker of known size in view (--marker) frame and unit are the marker's.
     The dataset has images/, transforms.json, in which one image in ten is held out, and camera.json, the camera that
     was found, for `run` (--camera.camera-file). What stands apart in the midst of the cameras gets a box, object_aabb
-    in transforms.json, which may be edited there; object.jpg shows it. Photographs are turned as their EXIF says. The
-    JSON file has: seen, chosen, blurred, images (with a camera), reasons (image -> why it has none), camera, error_px,
+    in transforms.json, which may be edited there; object.jpg shows it. Photographs are turned as their EXIF says.
+    Masks of the object, in a folder masks in or beside that of the photographs (white where it is), or an alpha
+    channel, keep what is around it out of the search for cameras, as where it was filmed on a turntable. The JSON file
+    has: seen, chosen, blurred, images (with a camera), reasons (image -> why it has none), camera, error_px,
     on_plane (whether up is a plane's), metres_per_unit (null: not known), marker (its number, how many images show it),
     object_aabb (null: none was found), notes, seconds.
     """
@@ -58,6 +60,12 @@ class Options:
     """Write the figures into this file."""
 
     def run(self) -> int:
+        """Capture, say what was found, and what is next."""
+        code = self.capture()
+        print(f"next: fieldpose train {self.out} --out {self.out}.safetensors")
+        return code
+
+    def capture(self) -> int:
         """Capture, say what was found."""
         if self.most < 2 * FEWEST or self.size < 64 or self.threads < 0:
             raise UsageError(f"--most must be at least {2 * FEWEST}, --size at least 64, and --threads at least 0")
@@ -101,7 +109,6 @@ def _in_words(captured: Captured, out: Path, seconds: float) -> Iterator[str]:
             f"{'; ' + advice(captured.reasons) if few else ''}"
         )
     yield from captured.notes
-    yield f"next: fieldpose train {out} --out {out}.safetensors"
 
 
 @contextmanager

@@ -124,7 +124,7 @@ class Options:
         shutil.rmtree(dataset, ignore_errors=True)
         kept.note("capture", made_of)
         options = capture.Options(self.source, dataset, marker=self.marker, family=self.family)
-        return _timed("capture", str(dataset), options.run, rows)
+        return _timed("capture", str(dataset), options.capture, rows)
 
     def _train(self, folder: Path, kept: _Kept, rows: list[_Row]) -> int:
         path = folder / FIELD

@@ -263,3 +263,56 @@ def test_cameras_that_cannot_be_adjusted_stay_as_mapped_and_that_is_told(
     captured = capture(str(tmp_path), tmp_path / "out", 150, 400, 2)
     assert captured.images == 14
     assert captured.notes == ("the cameras are as they were mapped, since adjusting them all found none (no camera)",)
+
+
+def on_a_turntable(count: int) -> tuple[list[np.ndarray], np.ndarray, list[np.ndarray]]:
+    """Images of what turns before a camera that stands still, a mask of that, and its poses.
+
+    What turns fills the middle; around it is the same in all images, with more texture.
+    """
+    rng, poses = np.random.default_rng(0), list(walk(count))
+    around = cv2.resize(rng.integers(0, 255, (90, 120, 3), np.uint8), (LENS.width, LENS.height), cv2.INTER_CUBIC)
+    rows, columns = np.mgrid[: LENS.height, : LENS.width]
+    inside = np.hypot((columns - 240) / 235, (rows - 180) / 175) < 1
+    return [np.where(inside[..., None], photograph(LENS, pose), around) for pose in poses], inside, poses
+
+
+def test_masks_keep_what_does_not_turn_along_out(tmp_path: Path) -> None:
+    images, inside, poses = on_a_turntable(20)
+    photos, masks = tmp_path / "images", tmp_path / "masks"
+    photos.mkdir()
+    for i, image in enumerate(images):
+        cv2.imwrite(str(photos / f"{i:02d}.jpg"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    masks.mkdir()
+    for i in range(20):
+        cv2.imwrite(str(masks / f"{i:02d}.png"), inside.astype(np.uint8) * 255)
+    captured = capture(str(photos), tmp_path / "out", 150, 480, 2)
+    assert captured.images >= 16
+    truth = {f"{i:02d}": pose for i, pose in enumerate(poses)}
+    degrees, length = errors(tmp_path / "out", truth)
+    assert degrees < 1.0
+    assert length < 0.08
+    dataset = load_dataset(tmp_path / "out", "all")
+    learnt = dataset.load_learnt(0)
+    np.testing.assert_array_equal(learnt, inside)
+    assert load_dataset(tmp_path / "out", "all", cut_out=True).scene == "object"
+    (masks / "03.png").unlink()
+    with pytest.raises(DatasetError, match=r"1 of 20 images have no mask there: .*03\.jpg"):
+        capture(str(photos), tmp_path / "other", 150, 480, 2)
+    cv2.imwrite(str(masks / "03.png"), np.zeros((48, 48), np.uint8))
+    with pytest.raises(SourceError, match=r"48x48 pixels, 03\.jpg, upright as its EXIF says, 480x360, another shape"):
+        capture(str(photos), tmp_path / "other", 150, 480, 2)
+
+
+def test_what_is_transparent_is_not_looked_at_and_stays_transparent(tmp_path: Path) -> None:
+    images, inside, _ = on_a_turntable(20)
+    (tmp_path / "photos").mkdir()
+    for i, image in enumerate(images):
+        alpha = np.where(inside, 255, 0).astype(np.uint8)
+        pixels = np.dstack([cv2.cvtColor(image, cv2.COLOR_RGB2BGR), alpha])
+        cv2.imwrite(str(tmp_path / "photos" / f"{i:02d}.png"), pixels)
+    assert capture(str(tmp_path / "photos"), tmp_path / "out", 150, 480, 2).images >= 16
+    dataset = load_dataset(tmp_path / "out", "all")
+    assert (dataset.scene, dataset.has_alpha) == ("object", True)
+    shown = dataset.load_image(0)
+    np.testing.assert_array_equal(shown[..., 3] == 255, inside)

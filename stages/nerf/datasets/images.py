@@ -120,6 +120,21 @@ def upright(path: Path) -> np.ndarray:
     return _read(path, turned)
 
 
+def upright_alpha(path: Path) -> np.ndarray | None:
+    """The alpha channel (h, w) uint8 of an image file, upright as its EXIF says; None where all of it is opaque.
+
+    Raises DatasetError.
+    """
+
+    def opaque(image: Image.Image) -> np.ndarray | None:
+        if not _has_alpha(image):
+            return None
+        alpha = _colours(ImageOps.exif_transpose(image), alpha=True)[..., 3]
+        return None if (alpha == 255).all() else alpha
+
+    return _read(path, opaque)
+
+
 def orientation(path: Path) -> int:
     """The EXIF orientation of an image file, 1 to 8; 1: as it is stored, and where it says nothing. DatasetError."""
     stated = _read(path, lambda image: image.getexif().get(ORIENTATION, 1))

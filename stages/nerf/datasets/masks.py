@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets.assemble import Draft
+from fieldpose.stages.nerf.datasets.frames import relative_name
 from fieldpose.stages.nerf.datasets.images import EXTENSIONS, is_image_name, probe
 from fieldpose.stages.nerf.datasets.intrinsics import same_shape
 from fieldpose.stages.nerf.datasets.parsing import listed
@@ -25,29 +26,39 @@ def with_masks(root: Path, draft: Draft) -> Draft:
     """
     if any(record.learnt_path is not None or record.mask_path is not None for record in draft.records):
         return draft
-    ways = {folder for record in draft.records for folder in _ways(root, record)}
+    masks = find_masks(root, [record.path for record in draft.records])
+    if masks is None:
+        return draft
+    records = [replace(record, learnt_path=masks[record.path]) for record in draft.records]
+    _check(records)
+    first = masks[draft.records[0].path]
+    where = next(folder for folder in first.parents if folder.name == FOLDER)
+    note = f"masks of {where} say what is learnt: white is, black is not"
+    return replace(draft, records=records, notes=(*draft.notes, note))
+
+
+def find_masks(root: Path, images: Sequence[Path]) -> dict[Path, Path] | None:
+    """The mask of each image, as with_masks finds them; None where there is no folder of masks. Raises DatasetError."""
+    ways = {folder for image in images for folder in _ways(root, image)}
     there = {folder: _files(folder / FOLDER) for folder in sorted(ways) if (folder / FOLDER).is_dir()}
     if not there:
-        return draft
+        return None
     where = next(iter(there)) / FOLDER
-    masks = {record.name: _mask_of(root, record, there) for record in draft.records}
-    without = [name for name, mask in masks.items() if mask is None]
+    masks = {image: _mask_of(root, image, there) for image in images}
+    without = [relative_name(root, image) for image, mask in masks.items() if mask is None]
     if without:
         raise DatasetError(
             f"{where}: {len(without)} of {len(masks)} images have no mask there: {listed(without)}; add them (white is"
             " learnt), or rename the folder to learn from whole images"
         )
-    records = [replace(record, learnt_path=masks[record.name]) for record in draft.records]
-    _check(records)
-    note = f"masks of {where} say what is learnt: white is, black is not"
-    return replace(draft, records=records, notes=(*draft.notes, note))
+    return {image: mask for image, mask in masks.items() if mask is not None}
 
 
-def _ways(root: Path, record: ImageRecord) -> list[Path]:
+def _ways(root: Path, image: Path) -> list[Path]:
     """The folders from the dataset's to that of an image."""
-    if not record.path.is_relative_to(root):
-        return [record.path.parent]
-    parts = record.path.relative_to(root).parts[:-1]
+    if not image.is_relative_to(root):
+        return [image.parent]
+    parts = image.relative_to(root).parts[:-1]
     return [root.joinpath(*parts[:i]) for i in range(len(parts) + 1)]
 
 
@@ -56,11 +67,11 @@ def _files(folder: Path) -> dict[str, Path]:
     return {path.relative_to(folder).as_posix().lower(): path for path in folder.rglob("*") if is_image_name(path)}
 
 
-def _mask_of(root: Path, record: ImageRecord, there: Mapping[Path, Mapping[str, Path]]) -> Path | None:
-    for folder in _ways(root, record):
-        whole = record.path.relative_to(folder)
-        for image in (whole, Path(*whole.parts[1:])) if len(whole.parts) > 1 else (whole,):
-            names = (f"{named.as_posix().lower()}{e}" for named in (image, image.with_suffix("")) for e in EXTENSIONS)
+def _mask_of(root: Path, image: Path, there: Mapping[Path, Mapping[str, Path]]) -> Path | None:
+    for folder in _ways(root, image):
+        whole = image.relative_to(folder)
+        for below in (whole, Path(*whole.parts[1:])) if len(whole.parts) > 1 else (whole,):
+            names = (f"{named.as_posix().lower()}{e}" for named in (below, below.with_suffix("")) for e in EXTENSIONS)
             found = next((name for name in names if name in there.get(folder, {})), None)
             if found is not None:
                 return there[folder][found]

@@ -20,6 +20,7 @@ from fieldpose.errors import UsageError
 COMMANDS = {
     "demo": "the embedded scene through the whole pipeline",
     "capture": "a video or photographs -> posed images to train on",
+    "calibrate": "a printed board in a video or photographs -> a camera file",
     "train": "posed images -> a field (.safetensors)",
     "estimate": "one image, in one process, without a bus",
     "run": "the pipeline: a source of images through every stage, each a process",

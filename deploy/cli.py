@@ -29,6 +29,7 @@ COMMANDS = {
     "control": "reset the tracking of a pipeline that is running, give it a guess, or ask how it is",
     "replay": "run the pipeline again on a recording's frames and compare the poses",
     "info": "what a recording holds, topic by topic, and what it lacks",
+    "poses": "a recording's poses for other programs: TUM's trajectories, COLMAP's models, CSV",
     "export": "a field's surface as a mesh or points, and a video of it",
     "edit": "a recorded sequence with a disturbance in it, to test how far tracking can be trusted",
     "recover": "save what can be saved of an unfinished or damaged recording",

@@ -213,17 +213,17 @@ def read_model(folder: Path) -> list[ModelImage]:
 def model_text(images: Sequence[ModelImage]) -> dict[str, str]:
     """The files of a model without points, name -> content, as COLMAP's text format has them; equal cameras are one."""
     shared = {camera: i + 1 for i, camera in enumerate(dict.fromkeys(image.camera for image in images))}
-    cameras = [f"# {len(shared)} cameras: number, model, width, height, parameters"]
+    cameras = [f"# cameras: {len(shared)}; number, model, width, height, parameters"]
     for camera, number in shared.items():
         held = to_colmap(camera, number, "poses")
         parameters = " ".join(repr(float(value)) for value in held.params)
         cameras.append(f"{number} {held.model.name} {camera.width} {camera.height} {parameters}")
-    posed = [f"# {len(images)} images: number, qw qx qy qz, tx ty tz of cam_from_world, camera, name; no points"]
+    posed = [f"# images: {len(images)}; number, qw qx qy qz, tx ty tz of cam_from_world, camera, name; no points"]
     for number, image in enumerate(images, start=1):
         x, y, z, w = Rotation.from_matrix(image.cam_from_world[:3, :3]).as_quat(canonical=True).tolist()
         pose = " ".join(map(repr, (w, x, y, z, *image.cam_from_world[:3, 3].tolist())))
         posed += [f"{number} {pose} {shared[image.camera]} {image.name}", ""]
-    named = {"cameras.txt": cameras, "images.txt": posed, "points3D.txt": ["# 0 points"]}
+    named = {"cameras.txt": cameras, "images.txt": posed, "points3D.txt": ["# points: 0"]}
     return {name: "\n".join(lines) + "\n" for name, lines in named.items()}
 
 

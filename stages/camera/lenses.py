@@ -82,7 +82,6 @@ class _Fit:
     matrix: np.ndarray
     lens: np.ndarray
     error_px: float
-    errors_px: np.ndarray
     focal_sd_px: float
     rotations: np.ndarray
     offsets: np.ndarray
@@ -140,7 +139,7 @@ def fit_lens(board: Board, views: Sequence[View], width: int, height: int) -> Le
     """The pinhole camera of images of that size, with the coefficients that views which are left out speak for.
 
     Views that fit far worse than the others are dropped. GeometryError where there are too few views, where they leave
-    the focal length open, or where a lens folds the image or is a fisheye.
+    the focal length open, or where no pinhole camera fits them.
     """
     _check_enough(views, "show the board")
     fitting = _Fitting(board, width, height)
@@ -223,7 +222,7 @@ class _Fitting:
         places, pixels = [self._places[view.ids] for view in views], [view.pixels.astype(np.float32) for view in views]
         flags |= _MODELS[model] | cv2.CALIB_USE_INTRINSIC_GUESS
         try:
-            error, matrix, lens, rotations, offsets, deviations, _, errors = cv2.calibrateCameraExtended(
+            error, matrix, lens, rotations, offsets, deviations, _, _ = cv2.calibrateCameraExtended(
                 places, pixels, self._size, start.copy(), np.zeros(5), flags=flags
             )
         except cv2.error:
@@ -231,7 +230,7 @@ class _Fitting:
         if not (np.isfinite(error) and np.isfinite(matrix).all() and matrix[0, 0] > 0 and matrix[1, 1] > 0):
             return None
         return _Fit(
-            matrix, lens.ravel()[:5], float(error), np.ravel(errors), float(deviations[0, 0]),
+            matrix, lens.ravel()[:5], float(error), float(deviations[0, 0]),
             np.reshape(rotations, (-1, 3)), np.reshape(offsets, (-1, 3)),
         )  # fmt: skip
 
@@ -246,8 +245,12 @@ class _Fitting:
         return errors
 
     def _posed_error(self, fit: _Fit, view: View) -> float:
+        """Mean squared error of a view whose pose is found by a lens that is given; infinite where there is none."""
         places = self._places[view.ids]
-        _, rotation, offset = cv2.solvePnP(places, view.pixels, fit.matrix, fit.lens)
+        try:
+            _, rotation, offset = cv2.solvePnP(places, view.pixels, fit.matrix, fit.lens)
+        except cv2.error:
+            return np.inf
         there, _ = cv2.projectPoints(places, rotation, offset, fit.matrix, fit.lens)
         return float(np.mean(np.sum((there[:, 0] - view.pixels) ** 2, axis=1)))
 

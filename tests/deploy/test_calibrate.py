@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
+import struct
 from collections.abc import Iterator, Sequence
 from itertools import count
 from pathlib import Path
@@ -117,6 +118,19 @@ def test_a_video_of_a_board(camera: Camera, reach: float, tall: float, tmp_path:
     check_is(found.camera, camera, 0.8)
     assert found.seen == 75
     assert found.views <= 20 < found.shown
+
+
+def test_a_video_is_turned_once_as_its_rotation_says(tmp_path: Path) -> None:
+    """Frames are stored lying, and the file says that they are to be turned by a quarter, as phones have it."""
+    upright = pictures(charuco(), UPRIGHT, poses(14, near=6.0, reach=0.25, tall=1.5))
+    path = film(tmp_path / "board.mp4", [np.ascontiguousarray(np.rot90(image)) for image in upright])
+    content = bytearray(path.read_bytes())
+    matrix = content.index(b"tkhd") + 44
+    content[matrix : matrix + 36] = struct.pack(">9i", 0, 1 << 16, 0, -1 << 16, 0, 0, 0, 0, 1 << 30)
+    path.write_bytes(content)
+    found = calibrate(str(path), CHARUCO, 60).camera
+    assert (found.width, found.height) == (480, 640)
+    np.testing.assert_allclose((found.fx, found.cx, found.cy), (520, 236, 325), atol=2.5)
 
 
 def test_a_chessboard(tmp_path: Path) -> None:

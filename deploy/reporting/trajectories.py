@@ -1,7 +1,7 @@
 """Poses of a pipeline as files that other programs read: trajectories of TUM's benchmark, and models of COLMAP.
 
-Only poses that tracking is sure of are in them. Source: Sturm and others, A benchmark for the evaluation of RGB-D SLAM
-systems (2012), for the first.
+Only poses that tracking is sure of are in them. Source of the trajectories: Sturm and others, A benchmark for the
+evaluation of RGB-D SLAM systems (2012).
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-from scipy.spatial.transform import Rotation
 
 from fieldpose.bus.messages import TrackingState
 from fieldpose.bus.topics import Address
@@ -48,12 +46,8 @@ class Trajectory:
     def names(self) -> list[str]:
         """Of the sure frames' images: their numbers, with the time of those whose number is there twice."""
         counts = Counter(frame.frame_id for frame in self.sure)
-        return [
-            f"{frame.frame_id:05d}.jpg"
-            if counts[frame.frame_id] == 1
-            else f"{frame.frame_id:05d}-{frame.capture_ns}.jpg"
-            for frame in self.sure
-        ]
+        whens = [f"-{frame.capture_ns}" if counts[frame.frame_id] > 1 else "" for frame in self.sure]
+        return [f"{frame.frame_id:05d}{when}.jpg" for frame, when in zip(self.sure, whens, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -65,9 +59,10 @@ class PoseFiles:
 
     def check(self) -> None:
         """Raise OutputError where they could not be written later. COLMAP reads whatever else is in its folder."""
-        check_writable(self.tum, None if self.colmap is None else _partial(self.colmap))
-        if self.colmap is not None and self.colmap.exists() and not _is_empty(self.colmap):
-            raise OutputError(f"{self.colmap}: is there already and not empty; name another folder, or remove it")
+        folder = self.colmap
+        if folder is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise OutputError(f"{folder}: is there already and not empty; name another folder, or remove it")
+        check_writable(self.tum, None if folder is None or folder.is_dir() else folder)
 
     def write(self, trajectory: Trajectory) -> Iterator[str]:
         """Write them; gives a line about each. Raises OutputError."""
@@ -89,6 +84,8 @@ def in_words(metadata: FieldMetadata | None) -> str:
 
 def to_tum(trajectory: Trajectory) -> bytes:
     """A line `seconds tx ty tz qx qy qz qw` for each sure frame, oldest first: object_from_cam, at the capture time."""
+    from scipy.spatial.transform import Rotation
+
     address = trajectory.address
     lines = [
         f"# object_from_cam: {address.camera} in the frame of {address.object}; camera axes x right, y down, z forward",
@@ -112,23 +109,17 @@ def _write_model(folder: Path, trajectory: Trajectory) -> int:
         for name, frame in zip(trajectory.names, trajectory.sure, strict=True)
         if frame.camera is not None and frame.cam_from_object is not None
     ]
-    partial = _partial(folder)
+    partial = folder.with_name(f"{folder.name}.partial")
     shutil.rmtree(partial, ignore_errors=True)
-    for name, text in model_text(images).items():
-        write_bytes(partial / name, text.encode())
     try:
+        for name, text in model_text(images).items():
+            write_bytes(partial / name, text.encode())
         os.replace(partial, folder)
     except OSError as error:
         raise OutputError(f"{folder}: cannot be written: {error.strerror}") from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
     return len(images)
-
-
-def _partial(folder: Path) -> Path:
-    return folder.with_name(f"{folder.name}.partial")
-
-
-def _is_empty(folder: Path) -> bool:
-    return folder.is_dir() and not any(folder.iterdir())
 
 
 def _count(trajectory: Trajectory) -> str:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Literal
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from fieldpose.errors import GeometryError
 from fieldpose.stages.geometry import Camera
@@ -212,6 +211,8 @@ def read_model(folder: Path) -> list[ModelImage]:
 
 def model_text(images: Sequence[ModelImage]) -> dict[str, str]:
     """The files of a model without points, name -> content, as COLMAP's text format has them; equal cameras are one."""
+    from scipy.spatial.transform import Rotation
+
     shared = {camera: i + 1 for i, camera in enumerate(dict.fromkeys(image.camera for image in images))}
     cameras = [f"# cameras: {len(shared)}; number, model, width, height, parameters"]
     for camera, number in shared.items():

@@ -19,6 +19,7 @@ from fieldpose.deploy.rig import planned_rig, read_rig
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import changed
 from fieldpose.errors import ConfigError, FieldposeError, UsageError
+from fieldpose.stages.structure.colmap import read_model
 
 SEQUENCE = f"mcap:{demo_file('sequence.mcap')}"
 
@@ -167,6 +168,7 @@ def test_two_objects_in_two_cameras_on_one_bus_are_kept_apart(
     assert f"a-nothing-left.tum: 0 poses of left in the frame of nothing; {frames} frames left out" in said
     sure = sum(row["state"] == "tracking" and (row["object"], row["camera_name"]) == ("lamp", "left") for row in rows)
     assert len((tmp_path / "a-lamp-left.tum").read_text().splitlines()) == 2 + sure
+    assert len(read_model(tmp_path / "model-lamp-left")) == sure > 0
     assert {path.name for path in tmp_path.glob("model*")} == {f"model-{p.replace('/', '-')}" for p in pipelines}
 
     held = info(recording)

@@ -89,47 +89,52 @@ class Shots:
 
 def read_shots(source: str, most: int, size: int, seconds: float, report: Report) -> Shots:
     """Of a video file, a folder of photographs, or a source as `run` takes it; see capturing.capture. SourceError."""
+    found = opened(source)
+    if isinstance(found, Path):
+        return _photographs(found, size, report)
+    return _frames(found, most, size, seconds, report)
+
+
+def opened(source: str) -> Path | Source:
+    """The folder of photographs, or the frames of a video, a camera or a recording, that a source is. SourceError."""
     path = Path(source)
     if path.is_dir():
-        return _photographs(path, size, report)
+        return path
     name = source if ":" in source and not path.exists() else f"video:{source}"
     if name.startswith("folder:"):
-        return _photographs(Path(name.partition(":")[2]), size, report)
+        return Path(name.partition(":")[2])
     if not is_video(name):
         raise SourceError(f"{source}: expected a video, a camera, a recording or a folder of photographs")
-    return _frames(open_source(CameraConfig(source=name)), most, size, seconds, report)
+    return open_source(CameraConfig(source=name))
 
 
-def _photographs(folder: Path, size: int, report: Report) -> Shots:
-    """All images of a folder, upright as their EXIF says, files that are there twice only once.
-
-    Those that stand where most lie, or the other way round, are turned by a quarter: one lens then has one camera.
-    """
+def photographs(folder: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """The images of a folder in their order, and what a user should know of its other files. SourceError for none."""
     paths = sorted((p for p in folder.iterdir() if is_image_name(p)), key=natural) if folder.is_dir() else []
     others = [p.name for p in sorted(folder.iterdir()) if p.suffix.lower() in _RAW] if folder.is_dir() else []
     left = () if not others else (f"{len(others)} files were not read, as {others[0]}; convert them to JPEG",)
     if not paths:
         raise SourceError(f"{folder}: no images in this folder; expected {', '.join(EXTENSIONS)}; {' '.join(left)}")
-    shots: list[Shot] = []
-    focals: list[float] = []
-    known: set[bytes] = set()
-    sizes: set[tuple[int, int]] = set()
-    stems = Counter(path.stem for path in paths)
+    return paths, left
+
+
+def of_one_lens(folder: Path, paths: Sequence[Path], report: Report) -> Iterator[tuple[Path, np.ndarray, float | None]]:
+    """Photographs (h, w, 3) uint8, upright as their EXIF says, with the focal length in pixels that it tells.
+
+    Those that stand where most lie, or the other way round, are turned by a quarter: one lens then has one camera.
+    Raises SourceError at the end where they are of several sizes or lenses.
+    """
     portrait = 2 * sum(height > width for width, height in map(upright_size, paths)) > len(paths)
-    masks = _masks(folder, paths)
+    sizes: set[tuple[int, int]] = set()
+    focals: list[float] = []
     for i, path in enumerate(paths):
-        image, (mask, alpha) = upright(path), masks(path)
+        image = upright(path)
         if (image.shape[0] > image.shape[1]) != portrait and image.shape[0] != image.shape[1]:
-            image = np.rot90(image)
-            mask, alpha = (None if part is None else np.rot90(part) for part in (mask, alpha))
+            image = np.ascontiguousarray(np.rot90(image))
         sizes.add((image.shape[1], image.shape[0]))
-        shot = _shot(path.stem if stems[path.stem] == 1 else path.name, image, size, mask, alpha)
-        if shot.file in known:
-            continue
-        known.add(shot.file)
-        shots.append(shot)
-        focal = focal_length_from_exif(path, shot.width, shot.height)
+        focal = focal_length_from_exif(path, image.shape[1], image.shape[0])
         focals += [] if focal is None else [focal]
+        yield path, image, focal
         report("reading the photographs", (i + 1) / len(paths))
     _check_shapes(folder, sizes)
     if focals and max(focals) > ONE_LENS * min(focals):
@@ -137,8 +142,48 @@ def _photographs(folder: Path, size: int, report: Report) -> Shots:
             f"{folder}: photographs of several lenses (EXIF tells of focal lengths of {min(focals):.0f} to"
             f" {max(focals):.0f} px); keep those of one lens, without zoom"
         )
-    focal = float(np.median(focals)) if len(focals) == len(shots) else None
-    return Shots(tuple(shots), len(paths), (), focal, False, left)
+
+
+def filmed(source: Source, seconds: float, report: Report) -> Iterator[np.ndarray]:
+    """The frames (h, w, 3) uint8 of a source, those of a live camera for so long. SourceError where sizes differ."""
+    live, began, first, seen = source.clock == "wall", time.monotonic(), None, 0
+    for image in _images(source):
+        size, seen = (image.shape[1], image.shape[0]), seen + 1
+        first = first or size
+        _check_shapes(source.description, {first, size})
+        yield image
+        filmed_s = time.monotonic() - began
+        if live and filmed_s >= seconds:
+            break
+        share = filmed_s / seconds if live else seen / source.length if source.length else 0.0
+        report("filming" if live else "choosing frames", min(share, 1.0))
+
+
+def cut_off(source: Source, seen: int) -> tuple[str, ...]:
+    """What a user should know of a video of which only so many frames could be read."""
+    if source.clock == "wall" or source.length is None or seen >= _WHOLE * source.length:
+        return ()
+    return (f"only {seen} of {source.length} frames could be read: is the file whole?",)
+
+
+def _photographs(folder: Path, size: int, report: Report) -> Shots:
+    """All images of a folder, files that are there twice only once."""
+    paths, left = photographs(folder)
+    shots: list[Shot] = []
+    focals: list[float] = []
+    known: set[bytes] = set()
+    stems = Counter(path.stem for path in paths)
+    masks = _masks(folder, paths)
+    for path, image, focal in of_one_lens(folder, paths, report):
+        mask, alpha = (_turned_along(part, image) for part in masks(path))
+        shot = _shot(path.stem if stems[path.stem] == 1 else path.name, image, size, mask, alpha)
+        if shot.file in known:
+            continue
+        known.add(shot.file)
+        shots.append(shot)
+        focals += [] if focal is None else [focal * shot.width / image.shape[1]]
+    focal_px = float(np.median(focals)) if len(focals) == len(shots) else None
+    return Shots(tuple(shots), len(paths), (), focal_px, False, left)
 
 
 def _check_shapes(source: Path | str, sizes: set[tuple[int, int]]) -> None:
@@ -153,28 +198,19 @@ def _frames(source: Source, most: int, size: int, seconds: float, report: Report
     from fieldpose.stages.structure.selection import Chooser, Meter
 
     meter, chooser = Meter(), Chooser[Shot](most)
-    live, began = source.clock == "wall", time.monotonic()
-    sizes: set[tuple[int, int]] = set()
     try:
-        for image in _images(source):
-            measured, filmed_s = meter(image), time.monotonic() - began
-            sizes.add((image.shape[1], image.shape[0]))
+        for image in filmed(source, seconds, report):
+            measured = meter(image)
             if chooser.wants(measured):
                 chooser.keep(measured, _shot(f"{chooser.seen - 1:05d}", image, size))
-            if live and filmed_s >= seconds:
-                break
-            share = filmed_s / seconds if live else chooser.seen / source.length if source.length else 0.0
-            report("filming" if live else "choosing frames", min(share, 1.0))
     except KeyboardInterrupt:
-        if not live:
+        if source.clock != "wall":
             raise
-    _check_shapes(source.description, sizes)
-    cut = not live and source.length is not None and chooser.seen < _WHOLE * source.length
-    notes = (f"only {chooser.seen} of {source.length} frames could be read: is the file whole?",) if cut else ()
     chosen, blurred = chooser.chosen()
     return Shots(
-        tuple(c.payload for c in chosen), chooser.seen, tuple(c.payload.name for c in blurred), None, True, notes
-    )
+        tuple(c.payload for c in chosen), chooser.seen, tuple(c.payload.name for c in blurred), None, True,
+        cut_off(source, chooser.seen),
+    )  # fmt: skip
 
 
 def _images(source: Source) -> Iterator[np.ndarray]:
@@ -204,6 +240,11 @@ def _masks(folder: Path, paths: Sequence[Path]) -> Callable[[Path], tuple[np.nda
         return np.where(load_mask(found[path], width, height), 255, 0).astype(np.uint8), None
 
     return mask_of
+
+
+def _turned_along(mask: np.ndarray | None, image: np.ndarray) -> np.ndarray | None:
+    """By a quarter, as of_one_lens turns an image that does not lie as most do."""
+    return mask if mask is None or mask.shape == image.shape[:2] else np.rot90(mask)
 
 
 def _shot(

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fieldpose.deploy.capturing import ENOUGH, FEWEST, OBJECT_PICTURE, Captured, Square, advice, capture, summary
-from fieldpose.deploy.reporting.output import check_new_folder, check_writable, progress_console, write_json
+from fieldpose.deploy.reporting.output import check_new_folder, check_writable, progress_bar, write_json
 from fieldpose.deploy.shots import FILMED_S
 from fieldpose.errors import UsageError
 
@@ -76,7 +74,7 @@ class Options:
         check_new_folder(self.out)
         check_writable(self.json)
         began = time.monotonic()
-        with _progress_bar() as report:
+        with progress_bar("capture") as report:
             square = None if self.marker is None else Square(self.family, self.marker)
             captured = capture(self.source, self.out, self.most, self.size, self.threads, report, square, self.seconds)
         seconds = time.monotonic() - began
@@ -109,24 +107,3 @@ def _in_words(captured: Captured, out: Path, seconds: float) -> Iterator[str]:
             f"{'; ' + advice(captured.reasons) if few else ''}"
         )
     yield from captured.notes
-
-
-@contextmanager
-def _progress_bar() -> Iterator[Callable[[str, float], None]]:
-    """Gives a function that shows what is done and its share, as lines where stderr is no terminal."""
-    console = progress_console()
-    columns = (BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        task, last = bar.add_task("reading", total=1.0), ""
-
-        def report(what: str, share: float) -> None:
-            nonlocal last, task
-            if what != last:
-                bar.remove_task(task)
-                task = bar.add_task(what, total=1.0)
-                if not console.is_terminal:
-                    console.print(f"capture: {what}")
-            last = what
-            bar.update(task, completed=share)
-
-        yield report

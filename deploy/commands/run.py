@@ -14,6 +14,7 @@ from fieldpose.deploy.processes.pipeline import Run, run_pipelines
 from fieldpose.deploy.reporting.output import check_picture, check_writable, write_bytes, write_json
 from fieldpose.deploy.reporting.report import live_line, print_plan, print_summary
 from fieldpose.deploy.reporting.results import RunResult, summarise, to_csv
+from fieldpose.deploy.reporting.trajectories import PoseFiles, Trajectory, in_words
 from fieldpose.deploy.rig import planned_rig, read_rig
 from fieldpose.deploy.settings import Settings, overridden
 from fieldpose.stages.camera.config import Pace
@@ -52,6 +53,12 @@ class Options:
     """Write the figures of the run into this file."""
     csv: Path | None = None
     """Write a row for each frame into this file."""
+    tum: Path | None = None
+    """Write the poses that are sure as a trajectory of TUM's benchmark, object_from_cam, into this file; several
+    pipelines each into its own, named after it."""
+    colmap: Path | None = None
+    """Write these poses and their cameras as a COLMAP model into this folder, the images named by their frame's number,
+    as 00012.jpg; several pipelines each into its own."""
     plot: Path | None = None
     """Draw errors, scores, latencies and states over time into this file (.png, .svg or .pdf)."""
     guess: str | None = None
@@ -98,6 +105,9 @@ class Options:
             return 0
         check_writable(self.record, self.json, self.csv)
         check_picture(self.plot)
+        files = [self._pose_files(plan, len(plans) > 1) for plan in plans]
+        for file in files:
+            file.check()
         with live_line(titles[0] if len(plans) == 1 else f"{len(plans)} pipelines") as report:
             outcomes = run_pipelines(Run(plans, self.record, self.listen, self.logs), report)
         figures = {}
@@ -111,7 +121,17 @@ class Options:
         if self.csv is not None:
             rows = zip((plan.settings.address for plan in plans), (outcome.frames for outcome in outcomes), strict=True)
             write_bytes(self.csv, to_csv(rows))
+        for plan, outcome, file in zip(plans, outcomes, files, strict=True):
+            for line in file.write(Trajectory(plan.settings.address, _unit(plan), outcome.frames)):
+                print(line)
         return INTERRUPTED if any(outcome.interrupted for outcome in outcomes) else 0
+
+    def _pose_files(self, plan: Plan, several: bool) -> PoseFiles:
+        pair = plan.settings.address.pair
+        return PoseFiles(
+            None if self.tum is None else _of_pipeline(self.tum, pair, several),
+            None if self.colmap is None else _of_pipeline(self.colmap, pair, several),
+        )
 
     def with_shortcuts(self) -> Settings:
         """The settings with the short flags applied. Raises ConfigError for bad values."""
@@ -130,6 +150,10 @@ class Options:
 def _title(plan: Plan, several: bool) -> str:
     source, address = plan.settings.camera.source, plan.settings.address
     return f"{address.object} in {address.camera} ({source})" if several else source
+
+
+def _unit(plan: Plan) -> str:
+    return in_words(None if plan.field is None else load_field(plan.field).metadata)
 
 
 def _of_pipeline(path: Path, pair: str, several: bool) -> Path:

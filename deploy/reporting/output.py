@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fieldpose.errors import OutputError
 
@@ -20,6 +22,27 @@ PICTURES = (".png", ".svg", ".pdf")
 def progress_console() -> Console:
     """Where progress goes: stderr, so that what a command prints can be read by other programs."""
     return Console(stderr=True)
+
+
+@contextmanager
+def progress_bar(command: str) -> Iterator[Callable[[str, float], None]]:
+    """Gives a function that shows what is done and its share, as lines of that command where stderr is no terminal."""
+    console = progress_console()
+    columns = (BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        task, last = bar.add_task("reading", total=1.0), ""
+
+        def report(what: str, share: float) -> None:
+            nonlocal last, task
+            if what != last:
+                bar.remove_task(task)
+                task = bar.add_task(what, total=1.0)
+                if not console.is_terminal:
+                    console.print(f"{command}: {what}")
+            last = what
+            bar.update(task, completed=share)
+
+        yield report
 
 
 def result_console() -> Console:

@@ -41,7 +41,7 @@ from fieldpose.bus.messages import Stats
 from fieldpose.bus.replay import RecordingInfo
 from fieldpose.bus.topics import Address
 from fieldpose.deploy.graph import AT_WORK
-from fieldpose.stages.geometry import rotation_error_deg, translation_error
+from fieldpose.stages.geometry import Camera, rotation_error_deg, translation_error
 from fieldpose.stages.tracking.scoring import deviations
 
 Outcome = Literal["finished", "lost", "dropped"]
@@ -64,7 +64,8 @@ class FrameResult:
     """What became of a frame; `cam_from_object` is the pose measured, None where none was.
 
     carried: the pose that tracking carried on with where none was measured. covariance: (6, 6) of the pose's left
-    twist, where it is known. level: how much was done to save time, where the pipeline adapts itself.
+    twist, where it is known. level: how much was done to save time, where the pipeline adapts itself. camera: the
+    frame's own, where it is known.
     """
 
     frame_id: int
@@ -83,6 +84,7 @@ class FrameResult:
     answered_ns: int | None = None
     stage_ms: Mapping[str, float] = field(default_factory=dict)
     level: int | None = None
+    camera: Camera | None = None
 
     @property
     def true_pose(self) -> np.ndarray | None:

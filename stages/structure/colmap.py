@@ -6,7 +6,7 @@ revisited (2016). pycolmap is imported where it is used, since nothing else shou
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -207,6 +207,25 @@ def read_model(folder: Path) -> list[ModelImage]:
         raise GeometryError(f"{folder}: no COLMAP model that can be read ({' '.join(str(error).split())})") from error
     cameras = {camera_id: _perspective(folder, camera) for camera_id, camera in scene.cameras.items()}
     return [ModelImage(name, cameras[camera], pose) for name, camera, pose in sorted(posed, key=lambda one: one[0])]
+
+
+def model_text(images: Sequence[ModelImage]) -> dict[str, str]:
+    """The files of a model without points, name -> content, as COLMAP's text format has them; equal cameras are one."""
+    from scipy.spatial.transform import Rotation
+
+    shared = {camera: i + 1 for i, camera in enumerate(dict.fromkeys(image.camera for image in images))}
+    cameras = [f"# cameras: {len(shared)}; number, model, width, height, parameters"]
+    for camera, number in shared.items():
+        held = to_colmap(camera, number, "poses")
+        parameters = " ".join(repr(float(value)) for value in held.params)
+        cameras.append(f"{number} {held.model.name} {camera.width} {camera.height} {parameters}")
+    posed = [f"# images: {len(images)}; number, qw qx qy qz, tx ty tz of cam_from_world, camera, name; no points"]
+    for number, image in enumerate(images, start=1):
+        x, y, z, w = Rotation.from_matrix(image.cam_from_world[:3, :3]).as_quat(canonical=True).tolist()
+        pose = " ".join(map(repr, (w, x, y, z, *image.cam_from_world[:3, 3].tolist())))
+        posed += [f"{number} {pose} {shared[image.camera]} {image.name}", ""]
+    named = {"cameras.txt": cameras, "images.txt": posed, "points3D.txt": ["# points: 0"]}
+    return {name: "\n".join(lines) + "\n" for name, lines in named.items()}
 
 
 def _perspective(folder: Path, camera: pycolmap.Camera) -> Camera:

@@ -19,6 +19,7 @@ from fieldpose.deploy.rig import planned_rig, read_rig
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import changed
 from fieldpose.errors import ConfigError, FieldposeError, UsageError
+from fieldpose.stages.structure.colmap import read_model
 
 SEQUENCE = f"mcap:{demo_file('sequence.mcap')}"
 
@@ -148,7 +149,8 @@ def test_two_objects_in_two_cameras_on_one_bus_are_kept_apart(
         "--pace", "lockstep", "--camera.frames", frames, "--rendering.size", "128",
         "--tracking.min-deadline-ms", "3000",
     ]  # fmt: skip
-    written = ["--record", recording, "--json", figures, "--csv", table]
+    written = ["--record", recording, "--json", figures, "--csv", table, "--tum", tmp_path / "a.tum"]
+    written += ["--colmap", tmp_path / "model"]
     assert main(["run", *map(str, (*arguments, *written))]) == 0
     said = capsys.readouterr().out
     assert all(f"{object} in {camera}" in said for object in ("lamp", "nothing") for camera in ("left", "right"))
@@ -163,6 +165,11 @@ def test_two_objects_in_two_cameras_on_one_bus_are_kept_apart(
     assert lamp["rotation_error_deg"]["median"] < 0.5
     rows = list(csv.DictReader(table.open()))
     assert {(row["object"], row["camera_name"]) for row in rows} == {tuple(pair.split("/")) for pair in pipelines}
+    assert f"a-nothing-left.tum: 0 poses of left in the frame of nothing; {frames} frames left out" in said
+    sure = sum(row["state"] == "tracking" and (row["object"], row["camera_name"]) == ("lamp", "left") for row in rows)
+    assert len((tmp_path / "a-lamp-left.tum").read_text().splitlines()) == 2 + sure
+    assert len(read_model(tmp_path / "model-lamp-left")) == sure > 0
+    assert {path.name for path in tmp_path.glob("model*")} == {f"model-{p.replace('/', '-')}" for p in pipelines}
 
     held = info(recording)
     assert held.lossless

@@ -15,14 +15,14 @@ from support.papered_room import photograph
 from fieldpose.deploy.cli import main
 from fieldpose.stages.geometry import Camera, look_at
 
-LENS = Camera(480, 360, 400.0, 400.0, 239.5, 179.5)
+LENS = Camera(320, 240, 267.0, 267.0, 159.5, 119.5)
 
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("video") / "walk.mp4"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 10.0, (LENS.width, LENS.height))  # type: ignore[attr-defined]
-    for along in np.linspace(-1.0, 1.0, 36):
+    for along in np.linspace(-0.6, 0.6, 20):
         eye = (-0.6 + 0.5 * np.cos(along), 0.8 * along, 0.2 * np.sin(3 * along))
         picture = photograph(LENS, look_at(eye, (1.8, 1.0, -0.2), (0, 0, 1)))
         writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
@@ -32,7 +32,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_video_becomes_poses_and_what_is_there_is_not_done_again(video: Path, tmp_path: Path) -> None:
     out, told = tmp_path / "room", tmp_path / "told.json"
-    given = ("start", video, "--out", out, "--minutes", "0.02", "--json", told)
+    given = ("start", video, "--out", out, "--minutes", "0.1", "--json", told)
     first = fieldpose(*given, cwd=tmp_path, timeout_s=240)
     assert first.returncode == 0, first.stderr
     steps = json.loads(told.read_text())["steps"]
@@ -49,7 +49,8 @@ def test_a_video_becomes_poses_and_what_is_there_is_not_done_again(video: Path, 
     ]  # fmt: skip
     assert (out / "field.safetensors").stat().st_mtime_ns == learnt
     rows = list(csv.DictReader((out / "poses.csv").read_text().splitlines()))
-    assert len(rows) == 36
+    assert len(rows) == 20
+    assert sum(bool(row["cam_from_object_00"]) for row in rows) > 10
     assert {"run.json", "timeline.png"} <= {p.name for p in out.iterdir()}
     other = fieldpose("start", video, "--out", out, "--marker", "0.1", cwd=tmp_path)
     assert other.returncode == 2

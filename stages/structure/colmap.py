@@ -210,7 +210,13 @@ def read_model(folder: Path) -> list[ModelImage]:
 
 
 def model_text(images: Sequence[ModelImage]) -> dict[str, str]:
-    """The files of a model without points, name -> content, as COLMAP's text format has them; equal cameras are one."""
+    """The files of a model without points, name -> content, as COLMAP's text format has them; equal cameras are one.
+
+    GeometryError for a name with a space, at which COLMAP would cut it off.
+    """
+    spaced = next((image.name for image in images if any(map(str.isspace, image.name))), None)
+    if spaced is not None:
+        raise GeometryError(f"{spaced!r}: COLMAP's text cannot hold a name with a space; rename the image")
     from scipy.spatial.transform import Rotation
 
     shared = {camera: i + 1 for i, camera in enumerate(dict.fromkeys(image.camera for image in images))}

@@ -13,10 +13,10 @@ from typing import Any, Literal
 import numpy as np
 from PIL import Image
 
-from fieldpose.errors import OutputError
+from fieldpose.errors import DatasetError, GeometryError, OutputError
 from fieldpose.stages.nerf.datasets.records import Dataset, ImageRecord
 from fieldpose.stages.nerf.datasets.transforms import FILE
-from fieldpose.stages.nerf.datasets.writing import colmap_model, transforms_document
+from fieldpose.stages.nerf.datasets.writing import transforms_document
 
 Target = Literal["transforms", "colmap"]
 IMAGES, DEPTHS, MASKS, OUTLINES = "images", "depth", "masks", "outlines"
@@ -104,12 +104,26 @@ def _companions(record: ImageRecord, name: str, folder: Path) -> dict[str, Any]:
 def _write_colmap(dataset: Dataset, below: Sequence[str], folder: Path) -> Converted:
     model = folder / MODEL
     model.mkdir(parents=True)
-    for name, text in colmap_model(below, [record.camera for record in dataset.images], _poses(dataset)).items():
+    for name, text in _model(dataset, below).items():
         (model / name).write_text(text, encoding="utf-8")
     if any(record.learnt_path is not None for record in dataset.images):
         for name, record in zip(below, dataset.images, strict=True):
             _write_mask(record, folder / MASKS / f"{name}.png")
     return Converted(len(below), 0, tuple(_lost_to_colmap(dataset)))
+
+
+def _model(dataset: Dataset, below: Sequence[str]) -> dict[str, str]:
+    # It brings COLMAP, which takes a while to import.
+    from fieldpose.stages.structure.colmap import ModelImage, model_text
+
+    images = [
+        ModelImage(name, record.camera, record.cam_from_object)
+        for name, record in zip(below, dataset.images, strict=True)
+    ]
+    try:
+        return model_text(images)
+    except GeometryError as error:
+        raise DatasetError(f"{dataset.root}: {error}") from error
 
 
 def _write_mask(record: ImageRecord, path: Path) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry import Camera, inverse
 from fieldpose.stages.nerf.datasets.frames import OPENCV_FROM_OPENGL
 
@@ -42,42 +41,6 @@ def transforms_document(
         document["test_filenames"] = [name for name in names if name in held_out]
     document["frames"] = frames
     return document
-
-
-def colmap_model(names: Sequence[str], cameras: Sequence[Camera], cam_from_object: np.ndarray) -> dict[str, str]:
-    """The files of a COLMAP model in text, without points: one camera and pose (n, 4, 4) an image.
-
-    names: paths below the folder of images; DatasetError for one with a space, at which COLMAP would cut it off.
-    """
-    from scipy.spatial.transform import Rotation
-
-    spaced = next((name for name in names if any(character.isspace() for character in name)), None)
-    if spaced is not None:
-        raise DatasetError(f"{spaced!r}: COLMAP's text cannot hold a name with a space; rename it, or write transforms")
-    ids = {camera: i + 1 for i, camera in enumerate(dict.fromkeys(cameras))}
-    lenses = [f"{i} {_colmap_lens(camera)}" for camera, i in ids.items()]
-    posed = []
-    for i, (name, camera, pose) in enumerate(zip(names, cameras, cam_from_object, strict=True), 1):
-        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
-        numbers = " ".join(repr(float(v)) for v in (w, x, y, z, *pose[:3, 3]))
-        posed.append(f"{i} {numbers} {ids[camera]} {name}\n")
-    return {
-        "cameras.txt": "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n" + "".join(f"{lens}\n" for lens in lenses),
-        "images.txt": "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME\n# POINTS2D[] as (X, Y, POINT3D_ID)\n"
-        + "".join(f"{line}\n" for line in posed),
-        "points3D.txt": "# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)\n",
-    }
-
-
-def _colmap_lens(camera: Camera) -> str:
-    """Model, size and parameters, by the simplest of COLMAP's models with two focal lengths that can hold it."""
-    k1, k2, p1, p2, k3 = camera.distortion
-    model = "PINHOLE"
-    lens: list[float] = []
-    if camera.is_distorted:
-        model, lens = ("OPENCV", [k1, k2, p1, p2]) if k3 == 0 else ("FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0])
-    numbers = (camera.fx, camera.fy, camera.cx + PIXEL_CENTRE, camera.cy + PIXEL_CENTRE, *lens)
-    return " ".join([model, str(camera.width), str(camera.height), *(repr(float(v)) for v in numbers)])
 
 
 def intrinsics(camera: Camera) -> dict[str, float]:

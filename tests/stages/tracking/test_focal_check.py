@@ -45,3 +45,17 @@ def test_frames_that_tell_little_count_for_little() -> None:
     check = check_of(*[0.0] * 20)
     check.note(0.5, 10.0)
     assert check.applied(TRACKING) is TRACKING
+
+
+def test_of_what_is_small_more_is_asked() -> None:
+    """A field's shape errs; of what tells little of the focal length it says the more of it."""
+    assert check_of(*[0.07] * 100, sigma=0.016).applied(TRACKING) is TRACKING
+    assert check_of(*[0.2] * 100, sigma=0.016).applied(TRACKING).reason is Reason.CAMERA_DIFFERS
+
+
+def test_frames_that_tell_nothing_change_nothing() -> None:
+    assert check_of(0.0, sigma=np.inf).applied(TRACKING) is TRACKING
+    check = check_of(*[0.05] * 20)
+    check.note(0.0, np.inf)
+    assert check.applied(TRACKING).state is TrackingState.LIMITED
+    assert np.isfinite(check.error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,9 +14,10 @@ from fieldpose.deploy.shots import FILMED_S, Report, cut_off, filmed, of_one_len
 from fieldpose.errors import DatasetError, GeometryError
 from fieldpose.stages.camera.boards import Board, Finder, View, seen_instead
 from fieldpose.stages.camera.core import Source
-from fieldpose.stages.camera.lenses import Lens, covered, descriptor, diverse, fit_lens, unseen
+from fieldpose.stages.camera.lenses import FEWEST_VIEWS, Lens, covered, descriptor, diverse, fit_lens, unseen
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.images import shrunk
+from fieldpose.stages.nerf.datasets.images import orientation
 
 _QUICK_SIDE = 960
 """Frames are looked through at this size, and at their own where they may be taken."""
@@ -66,7 +68,8 @@ def calibrate(
         notes = _look_at_photographs(found, gallery, report)
     else:
         notes = _look_at_frames(found, gallery, seconds, report)
-    instead = seen_instead(board, gallery.samples)
+    # A marker that lies about is no reason where the board has been seen often enough.
+    instead = seen_instead(board, gallery.samples) if len(gallery.views) < FEWEST_VIEWS else None
     if instead is not None:
         raise DatasetError(f"{source}: expected {_in_words(board)}, but the images show {instead}")
     if not gallery.views:
@@ -96,8 +99,14 @@ def _in_words(board: Board) -> str:
 
 def _look_at_photographs(folder: Path, gallery: _Gallery, report: Report) -> tuple[str, ...]:
     paths, left = photographs(folder)
-    for _, image, _ in of_one_lens(folder, paths, report):
+    # Turned otherwise, the lens would be as well, and its principal point elsewhere.
+    turned = Counter(orientation(path) for path in paths)
+    usual = turned.most_common(1)[0][0]
+    others = [path.name for path in paths if orientation(path) != usual]
+    for _, image, _ in of_one_lens(folder, [path for path in paths if path.name not in others], report):
         gallery.look(image, alone=True)
+    if others:
+        left += (f"{len(others)} photographs count for nothing, since the camera was held otherwise, as {others[0]}",)
     return left
 
 

@@ -6,17 +6,17 @@ import msgspec
 import numpy as np
 
 from fieldpose.errors import ConfigError, UsageError
-from fieldpose.stages.geometry import Similarity, nearest_point_to_axes, points_at_depth
-from fieldpose.stages.geometry.arrays import Points64, Vector
-from fieldpose.stages.nerf.framing import METRE, OWN_UNIT, SOLID, reframed, shown_at
-from fieldpose.stages.nerf.metadata import FieldMetadata, Frame
+from fieldpose.stages.geometry import Similarity, nearest_point_to_axes
+from fieldpose.stages.geometry.arrays import Vector
+from fieldpose.stages.nerf.datasets.bounds import too_coarse
+from fieldpose.stages.nerf.framing import METRE, OWN_UNIT, in_dataset_frame, reframed, shown_at
+from fieldpose.stages.nerf.metadata import FieldMetadata
 from fieldpose.stages.nerf.rendering_api import RayRenderer
+from fieldpose.stages.nerf.surface.samples import sampled_surface
 
+_SANE = 1e-9, 1e9
 PLANE = "plane"
 """In place of a direction or a point: that of what the object stands on."""
-_VIEWS, _LONGER_SIDE = 32, 160
-_CELLS = 48
-"""In the radius of the field's space; each that surface passes through counts as one point, however near it is seen."""
 
 
 class Framing:
@@ -76,22 +76,38 @@ class Framing:
 
     def say_metres(self, metres_per_unit: float) -> None:
         """The unit is known to be so long; no number changes."""
+        self._then(Similarity.identity())
+        frame = self.metadata.frame
         self.metadata = msgspec.structs.replace(self.metadata, metres_per_unit=metres_per_unit)
-        self._call(METRE if metres_per_unit == 1 else self.metadata.unit)
+        self._call(METRE if metres_per_unit == 1 else OWN_UNIT if frame.scale != 1 else frame.unit or OWN_UNIT)
 
     def back(self) -> None:
-        """The dataset's own frame and unit again."""
-        self._then(self.metadata.frame.object_from_dataset.inverse())
-        self._call(self.metadata.frame.unit or self.metadata.unit)
-        self.metadata = msgspec.structs.replace(self.metadata, frame=Frame())
+        """The dataset's own frame and unit again, and what it says of the unit's length."""
+        self.metadata = in_dataset_frame(self.metadata)
+
+    def check(self) -> None:
+        """Raise UsageError for a frame or a unit in which positions are too coarse, or lengths no sound numbers."""
+        low, high = _SANE
+        scale, metres = self.metadata.frame.scale, self.metadata.metres_per_unit or 1.0
+        if not (low < scale < high and low < metres < high):
+            raise UsageError(
+                f"lengths would be {scale:.3g} times the dataset's, and the unit {metres:.3g} m long; expected both"
+                f" from {low:g} to {high:g}"
+            )
+        if self.metadata.cameras:
+            coarse = too_coarse(np.stack([camera.pose for camera in self.metadata.cameras]))
+            if coarse is not None:
+                raise UsageError(f"{coarse}; choose an origin nearer to the object")
 
     def plane(self) -> tuple[Vector, float]:
         """Normal n and offset d, n @ x = d, of what the object stands on, in the frame as it was. ConfigError."""
         from fieldpose.stages.structure.upright import plane_under
 
+        if self._plane is None and not self._given.cameras:
+            raise ConfigError(f"the field does not tell its training views, from which the {PLANE} would be seen")
         if self._plane is None:
             poses = np.stack([camera.pose for camera in self._given.cameras])
-            self._plane = plane_under(poses, surface_of(self._renderer, self._given))
+            self._plane = plane_under(poses, sampled_surface(self._renderer, self._given).points)
         if self._plane is None:
             raise ConfigError(
                 "no plane was found under the object that most of what is around it lies on; give --up X,Y,Z and"
@@ -105,19 +121,6 @@ class Framing:
     def _then(self, change: Similarity) -> None:
         self.metadata = reframed(self.metadata, change)
         self._change = change.after(self._change)
-
-
-def surface_of(renderer: RayRenderer, metadata: FieldMetadata) -> Points64:
-    """Points (n, 3) of a field's surface, evenly spread, where its training views look."""
-    cameras, found = metadata.cameras, [np.empty((0, 3))]
-    for view in cameras[:: -(-len(cameras) // _VIEWS) or 1]:
-        seen = renderer.render_view(view.camera.undistorted().shrunk(_LONGER_SIDE), view.pose)
-        solid = (seen.opacity >= SOLID).ravel()
-        pixels, depth = seen.camera.grid()[solid], seen.depth.ravel()[solid]
-        found.append(points_at_depth(seen.camera, view.pose, pixels, depth))
-    points = np.concatenate(found)
-    _, one_each = np.unique(np.floor(points / (metadata.space.scale / _CELLS)), axis=0, return_index=True)
-    return np.asarray(points[one_each], np.float64)
 
 
 def numbers(text: str, count: int, expected: str) -> list[float]:

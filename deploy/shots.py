@@ -21,10 +21,12 @@ from fieldpose.stages.images import decoded, shrunk
 from fieldpose.stages.nerf.datasets.images import (
     EXTENSIONS,
     is_image_name,
+    is_opaque,
     load_mask,
     probe,
+    resized_rgba,
     upright,
-    upright_alpha,
+    upright_rgba,
     upright_size,
 )
 from fieldpose.stages.nerf.datasets.intrinsics import same_shape
@@ -174,9 +176,11 @@ def _photographs(folder: Path, size: int, report: Report) -> Shots:
     known: set[bytes] = set()
     stems = Counter(path.stem for path in paths)
     masks = _masks(folder, paths)
+    transparent = masks is None and any(probe(path).has_alpha and not is_opaque(path) for path in paths)
     for path, image, focal in of_one_lens(folder, paths, report):
-        mask, alpha = (_turned_along(part, image) for part in masks(path))
-        shot = _shot(path.stem if stems[path.stem] == 1 else path.name, image, size, mask, alpha)
+        name = path.stem if stems[path.stem] == 1 else path.name
+        pixels = _turned_along(upright_rgba(path), image) if transparent else image
+        shot = _shot(name, pixels, size, None if masks is None else _turned_along(masks(path), image))
         if shot.file in known:
             continue
         known.add(shot.file)
@@ -220,50 +224,44 @@ def _images(source: Source) -> Iterator[np.ndarray]:
             yield image
 
 
-def _masks(folder: Path, paths: Sequence[Path]) -> Callable[[Path], tuple[np.ndarray | None, np.ndarray | None]]:
-    """Gives of a photograph its mask, (h, w) uint8, where there is a folder of masks, else its alpha channel, if any.
+def _masks(folder: Path, paths: Sequence[Path]) -> Callable[[Path], np.ndarray] | None:
+    """Gives the mask (h, w) uint8 of a photograph, by a folder `masks` in theirs or beside it; None without one."""
+    found = find_masks(folder if (folder / MASKS).is_dir() else folder.parent, paths)
+    if found is None:
+        return None
 
-    The folder `masks` is in that of the photographs, or beside it where that is called images.
-    """
-    beside = folder.name == IMAGES and not (folder / MASKS).is_dir()
-    found = find_masks(folder.parent if beside else folder, paths)
-
-    def mask_of(path: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
-        if found is None:
-            return None, upright_alpha(path)
+    def mask_of(path: Path) -> np.ndarray:
         mask, (width, height) = probe(found[path]), upright_size(path)
         if not same_shape(mask, width, height):
             raise SourceError(
                 f"{found[path]}: the mask has {mask.width}x{mask.height} pixels, {path.name}, upright as its EXIF says,"
                 f" {width}x{height}, another shape; make it anew of the upright photograph"
             )
-        return np.where(load_mask(found[path], width, height), 255, 0).astype(np.uint8), None
+        return np.where(load_mask(found[path], width, height), 255, 0).astype(np.uint8)
 
     return mask_of
 
 
-def _turned_along(mask: np.ndarray | None, image: np.ndarray) -> np.ndarray | None:
+def _turned_along(part: np.ndarray, image: np.ndarray) -> np.ndarray:
     """By a quarter, as of_one_lens turns an image that does not lie as most do."""
-    return mask if mask is None or mask.shape == image.shape[:2] else np.rot90(mask)
+    return part if part.shape[:2] == image.shape[:2] else np.rot90(part)
 
 
-def _shot(
-    name: str, image: np.ndarray, size: int, mask: np.ndarray | None = None, alpha: np.ndarray | None = None
-) -> Shot:  # fmt: skip
-    """name: without an extension. mask and alpha (h, w) uint8."""
-    image = shrunk(np.ascontiguousarray(image), size)
-    height, width = image.shape[:2]
-    bgr = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    if alpha is None:
-        _, file = cv2.imencode(_OPAQUE, bgr, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+def _shot(name: str, image: np.ndarray, size: int, mask: np.ndarray | None = None) -> Shot:
+    """name: without an extension. image (h, w, 3) uint8, or (h, w, 4) with an alpha channel; mask (h, w) uint8."""
+    height, width = shrunk(image, size).shape[:2]
+    if image.shape[2] == 4:
+        ending, pixels = _TRANSPARENT, cv2.cvtColor(resized_rgba(image, width, height), cv2.COLOR_RGBA2BGRA)
+        options = []
     else:
-        small = cv2.resize(np.ascontiguousarray(alpha), (width, height), interpolation=cv2.INTER_AREA)
-        _, file = cv2.imencode(_TRANSPARENT, np.dstack([bgr, small]))
+        ending, pixels = _OPAQUE, cv2.cvtColor(shrunk(np.ascontiguousarray(image), size), cv2.COLOR_RGB2BGR)
+        options = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    _, file = cv2.imencode(ending, pixels, options)
     png = None
     if mask is not None:
         small = cv2.resize(np.ascontiguousarray(mask), (width, height), interpolation=cv2.INTER_NEAREST_EXACT)
         png = cv2.imencode(".png", small)[1].tobytes()
-    return Shot(f"{name}{_OPAQUE if alpha is None else _TRANSPARENT}", file.tobytes(), width, height, png)
+    return Shot(f"{name}{ending}", file.tobytes(), width, height, png)
 
 
 def _decoded(png: bytes) -> np.ndarray:

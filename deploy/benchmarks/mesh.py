@@ -17,6 +17,7 @@ from fieldpose.errors import DatasetError
 from fieldpose.stages.geometry import points_at_depth
 from fieldpose.stages.nerf.datasets import Dataset, load_dataset
 from fieldpose.stages.nerf.field import Field, load_field
+from fieldpose.stages.nerf.framing import in_dataset_frame
 from fieldpose.stages.nerf.kernels.density import densities
 from fieldpose.stages.nerf.loading import make_renderer
 from fieldpose.stages.nerf.normalise import normalised_points
@@ -47,8 +48,8 @@ class Truth:
 
 def measure(path: Path, dataset: Path, resolution: int, report: Callable[[str], None]) -> dict[str, Any]:
     """Both ways on a field of a dataset whose test views have true depth. Raises DatasetError where they have none."""
-    field = load_field(path)
-    data = load_dataset(dataset, "test", None).in_frame(field.metadata.frame.object_from_dataset)
+    field, data = load_field(path), load_dataset(dataset, "test", None)
+    field.metadata = in_dataset_frame(field.metadata)
     if any(record.depth_path is None for record in data.images):
         raise DatasetError(f"{dataset}: the test views have no true depth, by which a mesh could be measured")
     truth, region = true_surface(data), region_of(field.metadata.space)

@@ -23,6 +23,7 @@ from fieldpose.stages.nerf.blocks import View
 from fieldpose.stages.nerf.config import TrainingConfig
 from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.nerf.field import Field, load_field
+from fieldpose.stages.nerf.framing import in_dataset_frame
 from fieldpose.stages.nerf.from_dataset import replace_metadata, train_field, views_of
 from fieldpose.stages.nerf.kernels.types import Net
 from fieldpose.stages.nerf.renderer import NumbaRenderer
@@ -66,6 +67,7 @@ def measure(
 ) -> dict[str, Any]:
     """Everything that `fieldpose bench render` prints, as its JSON."""
     field = load_field(path)
+    field.metadata = in_dataset_frame(field.metadata)
     torch.set_num_threads(machine.cores())
     report("measuring the machine")
     limit = machine.limits(field.metadata.config, len(field.net.table))

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from fieldpose.deploy.framing import surface_of
 from fieldpose.deploy.learning import described
 from fieldpose.deploy.reporting.boxes import boxed, sheet
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_bytes, write_json
@@ -23,6 +22,7 @@ from fieldpose.stages.nerf.from_dataset import own_views
 from fieldpose.stages.nerf.loading import make_renderer
 from fieldpose.stages.nerf.metadata import FieldMetadata
 from fieldpose.stages.nerf.rendering_api import RayRenderer
+from fieldpose.stages.nerf.surface.samples import sampled_surface
 from fieldpose.stages.structure.box import object_box
 
 _PICTURES, _LONGER_SIDE = 6, 480
@@ -64,6 +64,8 @@ class Options:
         renderer = make_renderer(field, usable_cores())
         box = self._found(renderer, field.metadata) if self.box is None else np.reshape(self.box, (2, 3))
         alone = cropped(field, box)
+        if self.picture is not None and not field.metadata.cameras:
+            raise FieldFileError(f"{self.field}: does not tell its training views, of which --picture would be made")
         if self.picture is not None:
             write_bytes(self.picture, encoded(_picture(renderer, field.metadata, box), self.picture))
             print(f"{self.picture}: training views with the box")
@@ -83,7 +85,7 @@ class Options:
         if not metadata.cameras:
             raise FieldFileError(f"{self.field}: does not tell its training views; give --box X Y Z X Y Z")
         poses = np.stack([camera.pose for camera in metadata.cameras])
-        found = object_box(surface_of(renderer, metadata), poses)
+        found = object_box(sampled_surface(renderer, metadata).points, poses)
         if found is None:
             raise FieldFileError(
                 f"{self.field}: nothing stands apart where the training views look; give --box X Y Z X Y Z"

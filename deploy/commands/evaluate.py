@@ -92,16 +92,18 @@ class Options:
         from fieldpose.deploy.evaluation.running import Examination, shown
         from fieldpose.stages.nerf.datasets import load_dataset
         from fieldpose.stages.nerf.field import load_field
+        from fieldpose.stages.nerf.framing import in_dataset_frame
         from fieldpose.stages.nerf.loading import make_renderer, warm_up
         from fieldpose.stages.nerf.training_views import training_views
 
         check_writable(self.json, self.plot)
         self._check()
         field = load_field(self.field)
+        # Shifts and scores of the protocols are lengths of the dataset.
+        field.metadata = in_dataset_frame(field.metadata)
         names = self._methods(recalls=field.descriptors is not None)
         renderer = make_renderer(field, threads=0, backend=self.settings.backend)
-        dataset = load_dataset(self.dataset, "test", self.size).in_frame(field.metadata.frame.object_from_dataset)
-        surface = self._surface(field, renderer)
+        dataset, surface = load_dataset(self.dataset, "test", self.size), self._surface(field, renderer)
         protocol = self._protocol(surface)
         drawn = pairs.draw(protocol, [record.cam_from_object for record in dataset.images], self.seeds)
         images, covered = shown(dataset, drawn, self._thing(protocol))
@@ -109,7 +111,7 @@ class Options:
         warm_up(renderer, jacobian=True)
         about = {
             "protocol": dataclasses.asdict(protocol),
-            "unit": field.metadata.unit,
+            "unit": dataset.unit,
             "pairs": len(drawn),
             "seeds": list(self.seeds),
             "covered": covered,

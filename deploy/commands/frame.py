@@ -69,6 +69,7 @@ class Options:
             return 0
         framing = Framing(renderer, field.metadata)
         measured = self._applied(framing)
+        framing.check()
         field.metadata = framing.metadata
         try:
             field.save(out)
@@ -101,7 +102,7 @@ class Options:
 
     def _complaints(self) -> Iterator[str]:
         changes = (self.up, self.origin, self.known_distance, self.scale, self.metres_per_unit)
-        if self.page is not None and (self.reset or any(change is not None for change in changes)):
+        if self.page is not None and (self.reset or any(o is not None for o in (*changes, self.out, self.json))):
             yield "--page only writes the page; change the frame by another call"
         if self.reset and any(change is not None for change in changes):
             yield "--reset takes everything back; give the other options in a second call"

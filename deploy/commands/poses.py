@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,6 +51,9 @@ class Options:
         field = self._field()
         moved = None if field is None else field.frame.object_from_dataset
         address, frames = recorded_results(self.recording, self.pipeline, moved)
+        if field is None and any(frame.truth is not None for frame in frames):
+            print("the recording does not hold its field, so in which frame true poses are is not known: left out")
+            frames = [dataclasses.replace(frame, truth=None) for frame in frames]
         files = PoseFiles(self.tum, self.colmap)
         files.check()
         check_writable(self.csv)

@@ -21,9 +21,10 @@ from fieldpose.deploy.reporting.provenance import pipelines_in, recorded_field, 
 from fieldpose.deploy.reporting.report import live_line, print_summary
 from fieldpose.deploy.reporting.results import FrameResult, spread, summarise
 from fieldpose.deploy.settings import Settings, changed, read_file
-from fieldpose.errors import UsageError
+from fieldpose.errors import RecordingError, UsageError
 from fieldpose.stages.camera.config import Pace
-from fieldpose.stages.geometry import rotation_error_deg, translation_error
+from fieldpose.stages.geometry import Similarity, rotation_error_deg, translation_error
+from fieldpose.stages.nerf.field import load_metadata
 
 
 @dataclass(frozen=True)
@@ -60,12 +61,24 @@ class Options:
         with tempfile.TemporaryDirectory(prefix="fieldpose-") as folder, live_line("replay") as report:
             field = self.field or recorded_field(self.recording, recorded, Path(folder), self.pipeline)
             outcome = run_pipeline(planned(self._settings(), field), report, self.record)
+            now_from_then = self._change_of_frame(recorded, field, Path(folder))
         summary = summarise(outcome)
-        comparison = compare(recorded_poses(self.recording, self.pipeline), outcome.frames)
+        then = recorded_poses(self.recording, self.pipeline)
+        comparison = compare({i: now_from_then.of_poses(p[None])[0] for i, p in then.items()}, outcome.frames)
         print_summary(summary, f"replay of {self.recording}")
         _print(comparison, recorded)
         write_json(self.json, {**comparison, "replay": summary})
         return INTERRUPTED if outcome.interrupted else 0
+
+    def _change_of_frame(self, recorded: RecordingInfo, field: Path, folder: Path) -> Similarity:
+        """From the frame that recorded poses are in to that of the field that they are compared in."""
+        if self.field is None:
+            return Similarity.identity()
+        try:
+            before = load_metadata(recorded_field(self.recording, recorded, folder, self.pipeline)).frame
+        except RecordingError:
+            return Similarity.identity()
+        return load_metadata(field).frame.object_from_dataset.after(before.object_from_dataset.inverse())
 
     def _settings(self) -> Settings:
         settings = recorded_settings(self.recording, self.pipeline)

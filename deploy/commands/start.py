@@ -132,7 +132,6 @@ class Options:
         if path.is_file() and kept.has("train", made_of):
             rows.append(_row("train", str(path), None))
             return 0
-        path.unlink(missing_ok=True)
         options = train.Options(folder / DATASET, path, minutes=self.minutes, only=self.only)
         code = _timed("train", str(path), options.run, rows)
         if not code:
@@ -160,12 +159,14 @@ def _source(on: str) -> str:
 
 
 def _identity(source: str) -> list[Any]:
-    """By what a source is known again: its name, and of a file when it was changed, and its size."""
-    path = Path(source)
-    if not path.exists():
+    """By what a source is known again: its name, and of its files, when they were changed, and their sizes."""
+    named = Path(source)
+    path = named if named.exists() else Path(source.partition(":")[2])
+    if not path.name or not path.exists():
         return [source]
-    stat = path.stat()
-    return [str(path.resolve()), stat.st_mtime_ns, stat.st_size]
+    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+    stats = [(file, file.stat()) for file in files]
+    return [str(path.resolve()), *([file.name, stat.st_mtime_ns, stat.st_size] for file, stat in stats)]
 
 
 def _timed(step: str, result: str, do: Callable[[], int], rows: list[_Row]) -> int:

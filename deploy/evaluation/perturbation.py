@@ -18,7 +18,7 @@ class PerturbationNode:
     """A Handler that answers each frame's true pose with that pose, disturbed as in the paper's section V-B.
 
     A frame's disturbance depends on the seed and its frame_id alone; an object out of view has none.
-    object_from_dataset: from the frame of true poses into that of guesses.
+    object_from_dataset: from the frame of true poses, whose lengths the disturbance is in, into that of guesses.
     """
 
     name = "perturbation"
@@ -39,9 +39,11 @@ class PerturbationNode:
         if truth is None:
             return
         rng = np.random.default_rng([self._seed, message.header.frame_id])
-        pose = self._object_from_dataset.of_poses(np.array(truth, np.float64)[None])[0]
-        guess = perturb(pose, rng, self._disturbance.angle_deg, self._disturbance.max_translation)
-        yield PRIOR, Prior(header=reply_header(message.header), cam_from_object=guess)
+        guess = perturb(
+            np.array(truth, np.float64), rng, self._disturbance.angle_deg, self._disturbance.max_translation
+        )
+        moved = self._object_from_dataset.of_poses(guess[None])[0]
+        yield PRIOR, Prior(header=reply_header(message.header), cam_from_object=moved)
 
     def tick(self, now_ns: int) -> Iterator[Output]:
         yield from ()

@@ -20,7 +20,7 @@ from fieldpose.stages.geometry import Camera, Similarity
 
 TIMED = (FRAME, *BETWEEN_STAGES)
 """Topics of which headers are enough: when something was sent, and by whom."""
-_FRAMES_KEPT = 100_000
+FRAMES_KEPT = 100_000
 
 
 @dataclass
@@ -37,12 +37,14 @@ class _Seen:
 
 
 class Gathering:
-    """Everything about the frames of one pipeline; the newest 100,000 are kept.
+    """Everything about the frames of one pipeline.
 
-    object_from_dataset: into the frame that poses are in; true ones are in that of the dataset.
+    object_from_dataset: into the frame that poses are in; true ones are in that of the dataset. kept: how many of the
+    newest frames, None for all.
     """
 
-    def __init__(self, object_from_dataset: Similarity | None = None) -> None:
+    def __init__(self, object_from_dataset: Similarity | None = None, kept: int | None = FRAMES_KEPT) -> None:
+        self._kept = kept
         self._object_from_dataset = object_from_dataset or Similarity.identity()
         self._frames: OrderedDict[tuple[int, int], _Seen] = OrderedDict()
 
@@ -79,7 +81,7 @@ class Gathering:
         seen = self._frames.get(key)
         if seen is None:
             seen = self._frames[key] = _Seen(header.capture_ns)
-            if len(self._frames) > _FRAMES_KEPT:
+            if self._kept is not None and len(self._frames) > self._kept:
                 self._frames.popitem(last=False)
         return seen
 
@@ -99,7 +101,7 @@ def recorded_results(
     if pipeline not in addresses and (pipeline is not None or len(addresses) > 1):
         raise UsageError(f"{path}: holds the pipelines {', '.join(sorted(addresses))}; choose one with --pipeline")
     address = addresses[pipeline or next(iter(addresses))]
-    gathering = Gathering(object_from_dataset)
+    gathering = Gathering(object_from_dataset, kept=None)
     for recorded in read_recording(path, (*TIMED, CAMERA_INFO, TRUTH, STATE)):
         if address.covers(recorded.key):
             if recorded.topic in TIMED:

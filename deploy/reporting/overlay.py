@@ -24,11 +24,16 @@ def overlaid(image: np.ndarray, view: RenderedView) -> np.ndarray:
     Where the pose is right, the outlines lie on the image's own edges.
     """
     share = (_RENDER_SHARE * view.opacity)[..., None]
-    blended = (image * (1 - share) + view.rgb * share).astype(np.uint8)
+    return edges_over((image * (1 - share) + view.rgb * share).astype(np.uint8), view)
+
+
+def edges_over(image: np.ndarray, view: RenderedView) -> np.ndarray:
+    """An image (h, w, 3) uint8 with the edges of what was rendered, and its outlines."""
+    picture = image.copy()
     smooth = cv2.GaussianBlur(cv2.cvtColor(view.rgb, cv2.COLOR_RGB2GRAY), (3, 3), 0)
     edges = cv2.Canny(smooth, *_EDGE_THRESHOLDS) | _outline(view.opacity)
-    blended[edges > 0] = EDGE_RGB
-    return blended
+    picture[edges > 0] = EDGE_RGB
+    return picture
 
 
 def _outline(opacity: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from fieldpose.errors import OutputError, UsageError
+from fieldpose.errors import GeometryError, OutputError, UsageError
 from fieldpose.stages.camera.boards import Board, drawn
 
 KINDS = (".png", ".pdf")
@@ -23,6 +23,7 @@ _MARGIN_MM, _FOOT_MM = 10.0, 22.0
 """Around everything, which printers leave white, and for the text below the board."""
 _BAR_MM, _TICK_MM = 100, 10
 _TEXT_MM, _LINE_MM = 3.2, 0.25
+_FEWEST_DOTS = 8
 
 
 @dataclass(frozen=True)
@@ -39,11 +40,18 @@ class Sheet:
 
         Raises UsageError for a board that is larger than the paper.
         """
-        side = max(1, round(self.square_m * 1000 / _INCH_MM * self.dots))
+        side = round(self.square_m * 1000 / _INCH_MM * self.dots)
+        if side < _FEWEST_DOTS:
+            raise UsageError(
+                f"squares of {self.square_m * 1000:g} mm have {side} dots; give a larger --square or --dpi"
+            )
         dots_mm = side / (self.square_m * 1000)
         width_mm, height_mm = self._page()
         page = np.full((round(height_mm * dots_mm), round(width_mm * dots_mm)), 255, np.uint8)
-        board = drawn(self.board, side)
+        try:
+            board = drawn(self.board, side)
+        except GeometryError as error:
+            raise UsageError(f"--square or --dpi: {error}") from error
         left = (page.shape[1] - board.shape[1]) // 2
         top = max(round(_MARGIN_MM * dots_mm), (page.shape[0] - round(_FOOT_MM * dots_mm) - board.shape[0]) // 2)
         page[top : top + board.shape[0], left : left + board.shape[1]] = board

@@ -62,6 +62,8 @@ class PoseFiles:
         folder = self.colmap
         if folder is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise OutputError(f"{folder}: is there already and not empty; name another folder, or remove it")
+        if folder is not None and self.tum is not None and folder.resolve() == self.tum.resolve():
+            raise OutputError(f"{folder}: is named for the trajectory and for the model; give each its own")
         check_writable(self.tum, None if folder is None or folder.is_dir() else folder)
 
     def write(self, trajectory: Trajectory) -> Iterator[str]:
@@ -110,7 +112,8 @@ def _write_model(folder: Path, trajectory: Trajectory) -> int:
         if frame.camera is not None and frame.cam_from_object is not None
     ]
     partial = folder.with_name(f"{folder.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)
+    if partial.exists():
+        raise OutputError(f"{partial}: an unfinished model is in the way; remove it")
     try:
         for name, text in model_text(images).items():
             write_bytes(partial / name, text.encode())

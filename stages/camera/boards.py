@@ -22,6 +22,8 @@ Kind = Literal["charuco", "chess"]
 MARKER = 0.75
 """Side of a marker as a share of a square's: the white around it is then as wide as a cell of a 4x4 marker."""
 FEWEST_CORNERS = 6
+_OFF = 0.03
+"""Of a square's side: so much a drawn marker may be larger or smaller than was asked for."""
 _SPREAD = 0.4
 """Deviation in squares that a view's corners have at least in each direction: two rows of three have 0.5."""
 _LEAST, _MOST = 3, 40
@@ -123,7 +125,8 @@ class Finder:
 def drawn(board: Board, side: int) -> np.ndarray:
     """The board (down * side, across * side) uint8, black and white, with squares of so many pixels.
 
-    Cells of markers have whole pixels, so that a marker's side may be a little off.
+    Cells of markers have whole pixels, so that a marker's side may be a little off. Raises GeometryError where squares
+    have too few pixels for that.
     """
     white = (np.add.outer(np.arange(board.down), np.arange(board.across)) % 2 == 1).repeat(side, 0).repeat(side, 1)
     image = np.where(white, 255, 0).astype(np.uint8)
@@ -131,7 +134,11 @@ def drawn(board: Board, side: int) -> np.ndarray:
         return image
     markers = dictionary(board.family)
     cells = markers.markerSize + 2
-    marker = max(1, round(board.marker * side / cells)) * cells
+    marker = round(board.marker * side / cells) * cells
+    if abs(marker - board.marker * side) > _OFF * side or marker >= side:
+        raise GeometryError(
+            f"squares of {side} pixels are too small to draw their markers; print them larger, or finer"
+        )
     border = (side - marker) // 2
     squares = [(y, x) for y in range(board.down) for x in range(board.across) if (x + y) % 2 == 1]
     for number, (y, x) in enumerate(squares):

@@ -31,12 +31,14 @@ def cropped(field: Field, box: np.ndarray) -> Field:
     occupied[cells[((centres >= box[0] - slack) & (centres <= box[1] + slack)).all(axis=1)]] = True
     if not occupied.any():
         raise ConfigError(f"nothing of the field is in the box {in_words(box)}; give one around the object")
+    accuracy = field.metadata.accuracy
     metadata = msgspec.structs.replace(
         field.metadata,
         space=msgspec.structs.replace(space, box=(*low.tolist(), *high.tolist())),
         has_background=False,
         psnr_db=None,
         accuracy=None,
+        error_scale=field.metadata.error_scale if accuracy is None else accuracy.error_scale,
     )
     return Field(metadata, field.net, occupied.reshape(n, n, n))
 

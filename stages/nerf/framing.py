@@ -43,12 +43,23 @@ def reframed(metadata: FieldMetadata, new_from_old: Similarity) -> FieldMetadata
     )
 
 
+def in_dataset_frame(metadata: FieldMetadata) -> FieldMetadata:
+    """What a field says of itself in the frame and unit of its dataset."""
+    given = metadata.frame
+    if given.unit is None:
+        return metadata
+    back = reframed(metadata, given.object_from_dataset.inverse())
+    return msgspec.structs.replace(back, frame=Frame(), unit=given.unit, metres_per_unit=given.metres_per_unit)
+
+
 def shown_at(renderer: RayRenderer, metadata: FieldMetadata, name: str, x: float, y: float) -> np.ndarray:
     """The point (3,) of the surface that a training view shows at a pixel, by the size that it was learnt at.
 
     DatasetError where there is no such view; ConfigError where the pixel is outside, or shows nothing.
     """
     names = [camera.name for camera in metadata.cameras]
+    if not names:
+        raise ConfigError(f"the field does not tell its training views, so {name}:{x:g},{y:g} means nothing")
     view = metadata.cameras[names.index(find_name(names, name))]
     if not (-0.5 <= x <= view.width - 0.5 and -0.5 <= y <= view.height - 0.5):
         raise ConfigError(f"pixel {x:g},{y:g} is not in {view.name}, which was learnt at {view.width}x{view.height}")
@@ -63,7 +74,10 @@ def shown_at(renderer: RayRenderer, metadata: FieldMetadata, name: str, x: float
 def _changed(metadata: FieldMetadata, new_from_old: Similarity) -> Frame:
     whole = new_from_old.after(metadata.frame.object_from_dataset)
     rotation, translation = whole.rotation.ravel().tolist(), whole.translation.tolist()
-    return Frame(whole.scale, tuple(rotation), tuple(translation), metadata.frame.unit or metadata.unit)
+    before = metadata.frame
+    unit, metres = metadata.unit, metadata.metres_per_unit
+    unit, metres = (unit, metres) if before.unit is None else (before.unit, before.metres_per_unit)
+    return Frame(whole.scale, tuple(rotation), tuple(translation), unit, metres)
 
 
 def _moved(cameras: list[TrainingCamera], new_from_old: Similarity) -> list[TrainingCamera]:

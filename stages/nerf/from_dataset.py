@@ -203,7 +203,8 @@ def train_field(
     # Of what was learnt alone, images show much else beside it.
     field.descriptors = remember(images if box is None else own_views(field, training.threads))
     field.save(out)
-    if scores:
+    # Those are of the whole.
+    if scores and box is None:
         field.metadata = replace_metadata(field.metadata, psnr_db=float(np.mean(scores)))
     if not interrupted:
         field.metadata = replace_metadata(field.metadata, accuracy=examine(field, images))

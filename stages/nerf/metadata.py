@@ -57,13 +57,14 @@ class Space(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Frame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """From the dataset's coordinates to those that the field is used by: x = scale * rotation d + translation.
 
-    unit: the dataset's, where the field has another one.
+    unit and metres_per_unit: the dataset's, where frame or unit of the field have been changed; unit is None where not.
     """
 
     scale: float = 1.0
     rotation: Rows3 = UNTURNED
     translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     unit: str | None = None
+    metres_per_unit: float | None = None
 
     @property
     def object_from_dataset(self) -> Similarity:
@@ -132,7 +133,10 @@ class CameraFit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FieldMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Stored as JSON beside the arrays of a field."""
+    """Stored as JSON beside the arrays of a field.
+
+    error_scale: see PoseAccuracy; of the field that this is a part of, where it has not been tried itself.
+    """
 
     space: Space
     config: FieldConfig
@@ -147,6 +151,7 @@ class FieldMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     psnr_db: float | None = None
     accuracy: PoseAccuracy | None = None
     camera_fit: CameraFit | None = None
+    error_scale: float | None = None
     trained_seconds: float = 0.0
     trained_steps: int = 0
     made_by: str = ""

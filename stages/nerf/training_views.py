@@ -55,5 +55,5 @@ def training_views(field: Field) -> TrainingViews:
     accuracy = field.metadata.accuracy
     return TrainingViews(
         names, np.array(poses, dtype=np.float64).reshape(-1, 4, 4), field.descriptors, min(largest, DESCRIBED_SIZE),
-        1.0 if accuracy is None else accuracy.error_scale,
+        (field.metadata.error_scale or 1.0) if accuracy is None else accuracy.error_scale,
     )  # fmt: skip

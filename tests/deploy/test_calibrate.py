@@ -23,7 +23,7 @@ from fieldpose.deploy.calibrating import calibrate
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.reporting.sheets import Sheet, encoded
 from fieldpose.errors import DatasetError, SourceError, UsageError
-from fieldpose.stages.camera.boards import Board, Finder
+from fieldpose.stages.camera.boards import Board, Finder, dictionary
 from fieldpose.stages.camera.camera_files import read_camera_file
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.geometry import Camera
@@ -97,13 +97,18 @@ def test_photographs_of_a_board_become_a_camera_file(board_pictures: list[np.nda
     assert small.fx == pytest.approx(260, rel=0.004)
 
 
-def test_photographs_are_turned_upright_once(tmp_path: Path) -> None:
-    for i, image in enumerate(pictures(charuco(), UPRIGHT, poses(14, near=6.0, reach=0.3))):
+def test_photographs_are_turned_upright_once_and_those_held_otherwise_left_out(tmp_path: Path) -> None:
+    """Files are as the sensor lies; turned over, three of them would have the principal point elsewhere."""
+    for i, image in enumerate(pictures(charuco(), UPRIGHT, poses(17, near=6.0, reach=0.3))):
         exif = Image.Exif()
-        exif[ORIENTATION] = 8 if i % 2 else 1
-        stored = np.ascontiguousarray(np.rot90(image, -1)) if i % 2 else image
-        Image.fromarray(stored).save(tmp_path / f"{i:02d}.jpg", quality=97, exif=exif)
+        exif[ORIENTATION] = 6 if i % 6 == 5 else 8
+        Image.fromarray(np.ascontiguousarray(np.rot90(image, -1))).save(
+            tmp_path / f"{i:02d}.jpg", quality=97, exif=exif
+        )
     found = calibrate(str(tmp_path), CHARUCO, 60)
+    assert any(
+        "2 photographs count for nothing, since the camera was held otherwise, as 05.jpg" in n for n in found.notes
+    )
     assert (found.camera.width, found.camera.height) == (480, 640)
     np.testing.assert_allclose((found.camera.fx, found.camera.cx, found.camera.cy), (520, 236, 325), atol=1.5)
 
@@ -279,3 +284,24 @@ def test_what_cannot_be_printed_is_told(tmp_path: Path, capsys: pytest.CaptureFi
 def test_another_source_than_images_is_refused() -> None:
     with pytest.raises(SourceError, match="expected a video, a camera, a recording or a folder"):
         calibrate("dataset:nothing:train", CHARUCO, 60)
+
+
+def test_a_marker_that_lies_about_is_no_reason(tmp_path: Path) -> None:
+    for i, image in enumerate(pictures(charuco(), CAMERA, poses(14, near=5.0))):
+        if i == 3:
+            image[4:64, 4:64] = 255
+            image[10:58, 10:58] = cv2.aruco.generateImageMarker(dictionary("4x4"), 30, 48)[..., None]
+        Image.fromarray(image).save(tmp_path / f"{i:02d}.png")
+    assert calibrate(str(tmp_path), CHARUCO, 60).views >= 10
+
+
+@pytest.mark.parametrize("options", [["--square", "0.001", "--dpi", "72"], ["--square", "1e-7"]])
+def test_squares_too_small_to_draw_are_refused(
+    tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "board.png"
+    assert main(["calibrate", "--print-board", str(out), *options]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "--square" in said
+    assert not out.exists()

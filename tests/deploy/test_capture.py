@@ -279,7 +279,7 @@ def on_a_turntable(count: int) -> tuple[list[np.ndarray], np.ndarray, list[np.nd
 
 def test_masks_keep_what_does_not_turn_along_out(tmp_path: Path) -> None:
     images, inside, poses = on_a_turntable(20)
-    photos, masks = tmp_path / "images", tmp_path / "masks"
+    photos, masks = tmp_path / "photos", tmp_path / "masks"
     photos.mkdir()
     for i, image in enumerate(images):
         cv2.imwrite(str(photos / f"{i:02d}.jpg"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
@@ -305,14 +305,19 @@ def test_masks_keep_what_does_not_turn_along_out(tmp_path: Path) -> None:
 
 
 def test_what_is_transparent_is_not_looked_at_and_stays_transparent(tmp_path: Path) -> None:
+    """One photograph has no alpha channel, and one edge is half transparent."""
     images, inside, _ = on_a_turntable(20)
     (tmp_path / "photos").mkdir()
+    alpha = np.where(inside, 255, 0).astype(np.uint8)
+    alpha[170:190, 230:250] = 128
     for i, image in enumerate(images):
-        alpha = np.where(inside, 255, 0).astype(np.uint8)
         pixels = np.dstack([cv2.cvtColor(image, cv2.COLOR_RGB2BGR), alpha])
-        cv2.imwrite(str(tmp_path / "photos" / f"{i:02d}.png"), pixels)
+        cv2.imwrite(str(tmp_path / "photos" / f"{i:02d}.png"), pixels[..., :3] if i == 0 else pixels)
     assert capture(str(tmp_path / "photos"), tmp_path / "out", 150, 480, 2).images >= 16
     dataset = load_dataset(tmp_path / "out", "all")
     assert (dataset.scene, dataset.has_alpha) == ("object", True)
-    shown = dataset.load_image(0)
-    np.testing.assert_array_equal(shown[..., 3] == 255, inside)
+    named = {record.name: i for i, record in enumerate(dataset.images)}
+    shown = dataset.load_image(named["images/05.png"])
+    np.testing.assert_array_equal(shown[..., 3], alpha)
+    np.testing.assert_array_equal(shown[inside, :3], images[5][inside])
+    assert (dataset.load_image(named["images/00.png"])[..., 3] == 255).all()

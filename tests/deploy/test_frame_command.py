@@ -96,8 +96,7 @@ def test_it_is_taken_back_and_another_file_leaves_the_field_alone(field: Path, t
     assert main(["frame", str(other), "--reset"]) == 0
     found, given = load_field(other).metadata, load_field(field).metadata
     np.testing.assert_allclose([c.pose for c in found.cameras], [c.pose for c in given.cameras], atol=1e-12)
-    assert (found.unit, found.frame) == (given.unit, given.frame)
-    assert found.metres_per_unit == pytest.approx(0.003)
+    assert (found.unit, found.frame, found.metres_per_unit) == (given.unit, given.frame, given.metres_per_unit)
 
 
 @pytest.mark.parametrize(
@@ -116,6 +115,9 @@ def test_it_is_taken_back_and_another_file_leaves_the_field_alone(field: Path, t
         (["--known-distance", "1,0,0", "0,0,0", "nan"], "--known-distance nan: must be more than 0"),
         (["--page", "a.txt"], "expected a name that ends in .html"),
         (["--page", "a.html", "--scale", "2"], "only writes the page"),
+        (["--page", "a.html", "--json", "b.json"], "only writes the page"),
+        (["--scale", "1e-300"], "lengths would be 1e-300 times the dataset's"),
+        (["--origin=-500000,-5000000,0"], "where positions are good to"),
     ],
 )
 def test_what_cannot_be_meant_is_refused_and_changes_nothing(
@@ -151,9 +153,12 @@ def test_poses_are_found_in_the_new_frame(tmp_path: Path) -> None:
     test = load_dataset(demo_file("transforms_test.json").parent, "test")
     record = test.images[3]
     assert main(["estimate", str(path), str(record.path), "--json", str(told)]) == 0
-    found, truth = np.array(json.loads(told.read_text())["cam_from_object"]), test.in_frame(moved).images[3]
-    assert rotation_error_deg(found, truth.cam_from_object) < 0.5
-    assert translation_error(found, truth.cam_from_object) < 0.02 * moved.scale
+    found, truth = (
+        np.array(json.loads(told.read_text())["cam_from_object"]),
+        moved.of_poses(record.cam_from_object[None])[0],
+    )
+    assert rotation_error_deg(found, truth) < 0.5
+    assert translation_error(found, truth) < 0.02 * moved.scale
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
@@ -178,6 +183,31 @@ def test_clicks_in_a_browser_put_the_command_together(field: Path, tmp_path: Pat
     assert main(words[1:]) == 0
     metadata = load_metadata(field)
     assert metadata.frame.object_from_dataset.scale == pytest.approx(0.25 / np.linalg.norm(first - second), rel=1e-4)
+
+
+def test_what_the_unit_is_called_goes_along(field: Path) -> None:
+    for metres, unit in (("1", "metre"), ("0.001", "span"), ("1", "metre")):
+        assert main(["frame", str(field), "--metres-per-unit", metres]) == 0
+        metadata = load_metadata(field)
+        assert (metadata.metres_per_unit, metadata.unit) == (float(metres), unit)
+    assert main(["frame", str(field), "--reset"]) == 0
+    assert (load_metadata(field).metres_per_unit, load_metadata(field).unit) == (None, "span")
+
+
+@pytest.mark.parametrize(
+    "options", [["--up", "plane"], ["--origin", "plane"], ["--origin", "a:1,2"], ["--page", "p.html"]]
+)
+def test_fields_without_training_views_are_refused_where_these_are_needed(
+    tmp_path: Path, options: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    given = ball_field()
+    given.metadata.cameras.clear()
+    given.save(tmp_path / "bare.safetensors")
+    assert main(["frame", "bare.safetensors", *options]) == 2
+    assert "does not tell its training views" in capsys.readouterr().err
+    assert main(["crop", "bare.safetensors", "--box", "-1", "-1", "-1", "1", "1", "1", "--picture", "p.jpg"]) == 2
+    assert "does not tell its training views" in capsys.readouterr().err
 
 
 def test_a_page_holds_views_and_where_their_pixels_are(field: Path, tmp_path: Path) -> None:

@@ -95,8 +95,10 @@ def test_disturbances_repeat_by_seed_and_frame_in_whatever_order_the_frames_come
 def test_guesses_are_in_the_fields_frame_where_that_is_another_than_the_truths() -> None:
     truth = on_sphere(20, 30)
     moved = Similarity(2.5, rotation_about(np.array([1.0, 2.0, 3.0]), 0.7)[:3, :3], np.array([1.0, -2.0, 0.5]))
-    guess = priors(PerturbationNode(Disturbance((0.0, 0.0), 0.0), 5, moved), [3], truth)[3]
-    np.testing.assert_allclose(guess, moved.of_poses(truth[None])[0], atol=1e-9)
+    disturbance = Disturbance((10.0, 40.0), 0.2)
+    there = priors(PerturbationNode(disturbance, 5, moved), [3], truth)[3]
+    here = priors(PerturbationNode(disturbance, 5), [3], truth)[3]
+    np.testing.assert_allclose(there, moved.of_poses(here[None])[0], atol=1e-9)
 
 
 def test_an_object_out_of_view_has_no_guess() -> None:

@@ -13,6 +13,7 @@ from support.commands import fieldpose
 from support.papered_room import photograph
 
 from fieldpose.deploy.cli import main
+from fieldpose.deploy.commands.start import _identity
 from fieldpose.stages.geometry import Camera, look_at
 
 LENS = Camera(320, 240, 267.0, 267.0, 159.5, 119.5)
@@ -68,6 +69,29 @@ def test_a_capture_that_failed_is_done_again(tmp_path: Path, capsys: pytest.Capt
         (out / "dataset").mkdir(exist_ok=True)
         (out / "dataset" / "left.jpg").write_bytes(b"")
     assert not (out / "dataset" / "transforms.json").exists()
+
+
+def test_a_training_that_fails_leaves_the_field(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "dataset").mkdir(parents=True)
+    (out / "dataset" / "transforms.json").write_text("{}")
+    (out / "field.safetensors").write_bytes(b"learnt for hours")
+    (tmp_path / "photos").mkdir()
+    made_of = {"source": _identity(str(tmp_path / "photos")), "marker": None, "family": "4x4"}
+    (out / "start.json").write_text(json.dumps({"capture": made_of}))
+    assert main(["start", str(tmp_path / "photos"), "--out", str(out), "--only", "masks"]) == 2
+    assert (out / "field.safetensors").read_bytes() == b"learnt for hours"
+
+
+def test_a_source_that_has_changed_is_another(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    (folder / "a.jpg").write_bytes(b"1")
+    before = _identity(f"folder:{folder}")
+    assert before == _identity(str(folder))
+    (folder / "a.jpg").write_bytes(b"22")
+    assert before != _identity(f"folder:{folder}")
+    assert _identity("camera:0") == ["camera:0"]
 
 
 def test_folders_of_others_are_left_alone(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,13 +11,12 @@ from typing import Literal
 import numpy as np
 
 from fieldpose.errors import DatasetError
-from fieldpose.stages.geometry import camera_centres
 from fieldpose.stages.nerf.datasets import images
-from fieldpose.stages.nerf.datasets.bounds import SceneBounds, box_bounds, object_bounds, unbounded_bounds
+from fieldpose.stages.nerf.datasets.bounds import SceneBounds, box_bounds, object_bounds, too_coarse, unbounded_bounds
 from fieldpose.stages.nerf.datasets.records import Dataset, ImageRecord, Kind, PosedCamera, Scene
 
-_COARSEST = 3e-5
-"""Step of positions, as a share of how far cameras are spread: a tenth of what poses are found to."""
+_TRIED = 4
+"""Images with an alpha channel: where all of these are opaque everywhere, it says nothing."""
 Holdout = Literal["auto", "odd", "every8"]
 Split = Literal["train", "test", "all"]
 
@@ -96,16 +95,9 @@ def _check_masks(root: Path, records: Sequence[ImageRecord]) -> None:
 
 def _check_near(root: Path, records: Sequence[ImageRecord]) -> None:
     """DatasetError where numbers of 32 bits, which points have, are too coarse for a scene so far from its origin."""
-    centres = camera_centres(np.stack([record.cam_from_object for record in records]))
-    middle = np.median(centres, axis=0)
-    spread = float(np.median(np.linalg.norm(centres - middle, axis=1)))
-    step = float(np.spacing(np.float32(np.abs(middle).max())))
-    if step > _COARSEST * spread > 0:
-        offset = ", ".join(f"{value:.0f}" for value in middle)
-        raise DatasetError(
-            f"{root}: the cameras are around ({offset}), where positions are good to {step:.2g} only, in a scene of"
-            f" {spread:.2g}; subtract that, as of map coordinates, from all positions"
-        )
+    coarse = too_coarse(np.stack([record.cam_from_object for record in records]))
+    if coarse is not None:
+        raise DatasetError(f"{root}: {coarse}; subtract that, as of map coordinates, from all positions")
 
 
 def _bounds(scene: Scene, draft: Draft, train: list[ImageRecord]) -> SceneBounds:
@@ -127,13 +119,15 @@ def _plain_note(colour: images.Colour) -> tuple[str, ...]:
 
 def _is_transparent(records: list[ImageRecord]) -> bool:
     """Whether the images cut an object out by their alpha channel (one that is opaque everywhere does not)."""
-    with_alpha = [images.probe(record.path).has_alpha for record in records]
-    first = records[0]
-    if not with_alpha[0] or (images.load_pixels(first.path, *_size(first), alpha=True)[..., 3] == 255).all():
+    with_alpha = [record for record in records if images.probe(record.path).has_alpha]
+    first = next((record for record in with_alpha[:_TRIED] if not images.is_opaque(record.path)), None)
+    if first is None:
         return False
-    if not all(with_alpha):
-        path = records[with_alpha.index(False)].path
-        raise DatasetError(f"{path}: the image has no alpha channel, {first.path.name} has one; export them alike")
+    without = next((record for record in records if record not in with_alpha), None)
+    if without is not None:
+        raise DatasetError(
+            f"{without.path}: the image has no alpha channel, {first.path.name} has one; export them alike"
+        )
     return True
 
 

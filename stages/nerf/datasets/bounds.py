@@ -8,11 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from fieldpose.stages.geometry.cameras import Camera
-from fieldpose.stages.geometry.rigid import camera_centre, nearest_point_to_axes
+from fieldpose.stages.geometry.rigid import camera_centre, camera_centres, nearest_point_to_axes
 
 _AROUND_THE_VIEW = 1.05
 _AROUND_THE_CAMERAS = 1.05
 _NEAR_SHARE_OF_RADIUS = 0.05
+_COARSEST = 3e-5
+"""Step of positions, as a share of how far cameras are spread: a tenth of what poses are found to."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +66,18 @@ def unbounded_bounds(poses: Sequence[np.ndarray], depths: tuple[float, float] | 
     near = _NEAR_SHARE_OF_RADIUS * radius if depths is None else 0.9 * depths[0]
     aabb = np.stack([centre - radius, centre + radius])
     return SceneBounds(centre, radius, aabb, near, None if depths is None else depths[1])
+
+
+def too_coarse(poses: np.ndarray) -> str | None:
+    """Where cameras (n, 4, 4) are so far from the origin that the 32 bits of points are too few: that in words."""
+    centres = camera_centres(poses)
+    middle = np.median(centres, axis=0)
+    spread = float(np.median(np.linalg.norm(centres - middle, axis=1)))
+    step = float(np.spacing(np.float32(np.abs(middle).max())))
+    if not step > _COARSEST * spread > 0:
+        return None
+    offset = ", ".join(f"{value:.0f}" for value in middle)
+    return f"the cameras are around ({offset}), where positions are good to {step:.2g} only, in a scene of {spread:.2g}"
 
 
 def _mean_direction(poses: Sequence[np.ndarray]) -> np.ndarray:

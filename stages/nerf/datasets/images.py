@@ -52,7 +52,7 @@ def load_pixels(path: Path, width: int, height: int, alpha: bool) -> np.ndarray:
     missing, truncated or no image.
     """
     pixels = _read(path, lambda image: _colours(image, alpha))
-    return _resize_rgba(pixels, width, height) if alpha else _resize(pixels, width, height)
+    return resized_rgba(pixels, width, height) if alpha else _resize(pixels, width, height)
 
 
 def load_depth(path: Path, width: int, height: int, scale: float) -> np.ndarray:
@@ -120,19 +120,14 @@ def upright(path: Path) -> np.ndarray:
     return _read(path, turned)
 
 
-def upright_alpha(path: Path) -> np.ndarray | None:
-    """The alpha channel (h, w) uint8 of an image file, upright as its EXIF says; None where all of it is opaque.
+def upright_rgba(path: Path) -> np.ndarray:
+    """The pixels (h, w, 4) uint8 of an image file, turned as its EXIF orientation says. Raises DatasetError."""
+    return _read(path, lambda image: _colours(ImageOps.exif_transpose(image), alpha=True))
 
-    Raises DatasetError.
-    """
 
-    def opaque(image: Image.Image) -> np.ndarray | None:
-        if not _has_alpha(image):
-            return None
-        alpha = _colours(ImageOps.exif_transpose(image), alpha=True)[..., 3]
-        return None if (alpha == 255).all() else alpha
-
-    return _read(path, opaque)
+def is_opaque(path: Path) -> bool:
+    """Whether an image file has no alpha channel, or one that is opaque everywhere. Raises DatasetError."""
+    return _read(path, lambda image: not _has_alpha(image) or bool((_colours(image, alpha=True)[..., 3] == 255).all()))
 
 
 def orientation(path: Path) -> int:
@@ -188,8 +183,8 @@ def _resize(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
     return cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
 
 
-def _resize_rgba(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Average colours weighted by alpha, so that what lies behind transparent pixels does not bleed into edges."""
+def resized_rgba(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
+    """(height, width, 4) uint8: colours are averaged weighted by alpha, so that none from behind bleed into edges."""
     if pixels.shape[:2] == (height, width):
         return pixels
     weighted = pixels.astype(np.float32)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import json
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ import msgspec
 import numpy as np
 
 from fieldpose.errors import DatasetError
-from fieldpose.stages.geometry import Camera, Similarity
+from fieldpose.stages.geometry import Camera
 from fieldpose.stages.nerf.datasets import images
 from fieldpose.stages.nerf.datasets.bounds import SceneBounds
 
@@ -134,28 +133,6 @@ class Dataset:
         """The same dataset with every image's longer side shrunk to `size` pixels; none is enlarged."""
         return replace(self, images=tuple(replace(record, camera=record.camera.shrunk(size)) for record in self.images))
 
-    def in_frame(self, object_from_dataset: Similarity) -> Dataset:
-        """The same images in another frame and unit; boxes become those around what they were."""
-        scale = object_from_dataset.scale
-        poses = object_from_dataset.of_poses(np.stack([record.cam_from_object for record in self.images]))
-        images = tuple(
-            replace(
-                record, cam_from_object=pose, near=_times(record.near, scale), far=_times(record.far, scale),
-                depth_scale=_times(record.depth_scale, scale),
-            )
-            for record, pose in zip(self.images, poses, strict=True)
-        )  # fmt: skip
-        bounds, box = self.bounds, self.object_aabb
-        moved = replace(
-            bounds, centre=object_from_dataset.of_points(bounds.centre[None])[0], radius=bounds.radius * scale,
-            aabb=_box_around(bounds.aabb, object_from_dataset), near=bounds.near * scale, far=_times(bounds.far, scale),
-        )  # fmt: skip
-        return replace(
-            self, images=images, bounds=moved, scale=self.scale * scale,
-            metres_per_unit=_times(self.metres_per_unit, 1 / scale),
-            object_aabb=None if box is None else _box_around(box, object_from_dataset),
-        )  # fmt: skip
-
     def content_hash(self) -> str:
         """sha256 (hex) over names, cameras, poses and the bytes of the image files."""
         digest = hashlib.sha256()
@@ -166,17 +143,6 @@ class Dataset:
             digest.update(np.ascontiguousarray(record.cam_from_object, dtype="<f8").tobytes())
             digest.update(record.path.read_bytes())
         return digest.hexdigest()
-
-
-def _times(length: float | None, scale: float) -> float | None:
-    return None if length is None else length * scale
-
-
-def _box_around(box: np.ndarray, similarity: Similarity) -> np.ndarray:
-    """The box (2, 3) with sides along the new axes around one of the old."""
-    corners = np.array(list(itertools.product(*box.T)))
-    moved = similarity.of_points(corners)
-    return np.stack([moved.min(axis=0), moved.max(axis=0)])
 
 
 def find_name(names: list[str], wanted: str) -> str:

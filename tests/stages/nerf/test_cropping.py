@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -14,7 +15,9 @@ from fieldpose.stages.nerf.cropping import cropped
 from fieldpose.stages.nerf.datasets import load_dataset
 from fieldpose.stages.nerf.field import Field, load_field
 from fieldpose.stages.nerf.framing import reframed
+from fieldpose.stages.nerf.metadata import PoseAccuracy
 from fieldpose.stages.nerf.renderer import NumbaRenderer
+from fieldpose.stages.nerf.training_views import training_views
 
 
 @pytest.fixture(scope="module")
@@ -60,8 +63,10 @@ def test_within_the_box_it_is_the_same_and_outside_nothing_is(demo: Field, box: 
 
 
 def test_a_part_can_be_saved_and_cut_again(demo: Field, box: np.ndarray, tmp_path: Path) -> None:
-    alone = cropped(demo, box)
+    tried = msgspec.structs.replace(demo.metadata, accuracy=PoseAccuracy(9, 9, 0.1, 0.01, error_scale=1.5))
+    alone = cropped(Field(tried, demo.net, demo.occupied), box)
     assert (alone.metadata.has_background, alone.metadata.accuracy, alone.metadata.psnr_db) == (False, None, None)
+    assert training_views(alone).error_scale == alone.metadata.error_scale == 1.5
     assert alone.occupied.sum() < 0.2 * demo.occupied.sum()
     path = tmp_path / "alone.safetensors"
     alone.save(path)
@@ -74,6 +79,7 @@ def test_a_part_can_be_saved_and_cut_again(demo: Field, box: np.ndarray, tmp_pat
     assert higher.metadata.space.corners is not None
     assert higher.metadata.space.corners[0, 2] > alone.metadata.space.corners[0, 2]
     assert cropped(higher, box).metadata.space == higher.metadata.space
+    assert cropped(higher, box).metadata.error_scale == 1.5
 
 
 def test_boxes_that_hold_nothing_are_refused(demo: Field) -> None:

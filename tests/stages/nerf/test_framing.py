@@ -14,7 +14,7 @@ from fieldpose.errors import ConfigError, DatasetError
 from fieldpose.stages.geometry import Camera, Similarity, camera_centre, look_at, rotation_about
 from fieldpose.stages.nerf.config import FieldConfig
 from fieldpose.stages.nerf.field import Field, load_field, load_metadata, new_net
-from fieldpose.stages.nerf.framing import reframed, shown_at
+from fieldpose.stages.nerf.framing import in_dataset_frame, reframed, shown_at
 from fieldpose.stages.nerf.metadata import CameraFit, FieldMetadata, Frame, PoseAccuracy, Space
 from fieldpose.stages.nerf.normalise import normalised_points, object_points
 from fieldpose.stages.nerf.renderer import NumbaRenderer
@@ -125,7 +125,8 @@ def test_changes_add_up_and_are_taken_back(tmp_path: Path) -> None:
     path = tmp_path / "moved.safetensors"
     Field(twice, ball_field().net, ball_field().occupied).save(path)
     assert load_metadata(path) == load_field(path).metadata == twice
-    back = reframed(twice, whole.inverse())
+    back = in_dataset_frame(twice)
+    assert (back.unit, back.metres_per_unit, back.frame) == (metadata.unit, 0.2, metadata.frame)
     np.testing.assert_allclose([c.pose for c in back.cameras], [c.pose for c in metadata.cameras], atol=1e-12)
     np.testing.assert_allclose(back.space.turn, np.eye(3), atol=1e-12)
     np.testing.assert_allclose(back.space.centre, (0, 0, 0), atol=1e-12)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
@@ -15,7 +16,7 @@ from fieldpose.bus.transport import ZenohBus
 from fieldpose.deploy.bridges.ros2 import RosBridge, RosTopics
 from fieldpose.deploy.bridges.ros_messages import Distro, Frames, RosMessages, topics_in_words
 from fieldpose.deploy.processes.endpoints import peer_address
-from fieldpose.errors import UsageError
+from fieldpose.errors import ConfigError, UsageError
 
 _HUB_S = 5.0
 
@@ -47,8 +48,10 @@ class Options:
     """The node's namespace."""
     node: str = "fieldpose"
     """The node's name."""
-    metres: float = 1.0
-    """Length of the field's unit in metres; `fieldpose info FIELD` shows it, where it is known."""
+    field: Path | None = None
+    """The field (.safetensors) that is tracked, for the length of its unit in metres."""
+    metres: float | None = None
+    """That length instead of the field's; 1 where neither is given."""
     frames: Frames = dataclasses.field(default_factory=Frames)
     topics: RosTopics = dataclasses.field(default_factory=RosTopics)
     address: Annotated[Address, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Address)
@@ -61,7 +64,8 @@ class Options:
                 f"--connect and --router are both {self.connect}; expected the pipeline's hub and the router of ROS, of"
                 " which one has to listen on another port"
             )
-        messages = RosMessages(self.frames, self.metres, self.distro)
+        metres = self.metres_of_unit()
+        messages = RosMessages(self.frames, metres, self.distro)
         names = RosNames(self.domain, self.namespace, self.node, self.keys)
         with StopSignals() as signals:
             bus = ZenohBus(self.connect, peer_address(self.connect))
@@ -70,7 +74,8 @@ class Options:
                 node = RosNode(self.router, names)
                 try:
                     bridge = RosBridge(bus, self.address, node, names, self.topics, messages)
-                    print(f"publishes {topics_in_words(bridge.published) or 'nothing'}", flush=True)
+                    said = topics_in_words(bridge.published) or "nothing"
+                    print(f"publishes {said}; a unit of the field is {metres:g} m", flush=True)
                     if bridge.taken:
                         print(f"takes {topics_in_words(bridge.taken)}", flush=True)
                     bridge.run(signals.stop)
@@ -79,3 +84,17 @@ class Options:
             finally:
                 bus.close()
         return 0
+
+    def metres_of_unit(self) -> float:
+        """Length of the field's unit. Raises ConfigError where the field does not know it, and FieldFileError."""
+        if self.metres is not None or self.field is None:
+            return 1.0 if self.metres is None else self.metres
+        from fieldpose.stages.nerf.field import load_metadata
+
+        metadata = load_metadata(self.field)
+        if metadata.metres_per_unit is None:
+            raise ConfigError(
+                f"{self.field}: lengths are in the {metadata.unit}, and how long that is in metres is not known; give"
+                " --metres, or the field a scale with `fieldpose frame`"
+            )
+        return metadata.metres_per_unit

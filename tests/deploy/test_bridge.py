@@ -11,14 +11,15 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
-from support.commands import command
+from support.commands import command, save_empty_field
 from support.tracking_world import on_sphere
 from zenoh_ros2_sdk import ROS2Publisher, ROS2Subscriber
 from zenoh_ros2_sdk.attachment import Attachment
@@ -45,8 +46,10 @@ from fieldpose.deploy.bridges.ros_messages import (
     is_sure,
     pose_in_ros,
 )
-from fieldpose.deploy.cli import main
+from fieldpose.deploy.cli import main, parse
+from fieldpose.deploy.commands import bridge
 from fieldpose.deploy.processes.endpoints import free_port
+from fieldpose.deploy.scene import demo_file
 from fieldpose.errors import ConfigError, GeometryError
 from fieldpose.stages.geometry import exp_se3, inverse
 
@@ -273,10 +276,23 @@ def test_what_cannot_be_bridged_is_one_line(capsys: pytest.CaptureFixture[str]) 
         assert said.count("\n") == 1
 
 
+def test_the_length_of_a_unit_is_the_fields_own(tmp_path: Path) -> None:
+    def metres(*options: object) -> float:
+        arguments = ["ros2", "--connect", "a", "--router", "b", *(str(option) for option in options)]
+        return float(parse(bridge.Options, "bridge", arguments).metres_of_unit())
+
+    assert metres("--field", demo_file("field.safetensors")) == 0.1
+    assert metres("--field", demo_file("field.safetensors"), "--metres", 2) == 2.0
+    assert metres() == 1.0
+    unknown = save_empty_field(tmp_path / "field.safetensors")
+    with pytest.raises(ConfigError, match="how long that is in metres is not known; give --metres"):
+        metres("--field", unknown)
+
+
 @contextmanager
-def serving() -> Iterator[str]:
+def serving(where: str | None = None) -> Iterator[str]:
     """A router of Zenoh, as a pipeline's hub and ROS' rmw_zenohd are."""
-    address, stop = f"tcp/127.0.0.1:{free_port()}", threading.Event()
+    address, stop = where or f"tcp/127.0.0.1:{free_port()}", threading.Event()
     thread = threading.Thread(target=serve_hub, args=(address, None, stop))
     thread.start()
     try:
@@ -404,6 +420,18 @@ def test_a_ros_node_hears_what_tracking_is_sure_of() -> None:
         }  # fmt: skip
 
 
+def test_a_router_of_ros_that_returns_is_found_again() -> None:
+    address = f"tcp/127.0.0.1:{free_port()}"
+    with serving() as hub, joined(hub) as bus, ExitStack() as stack:
+        tracking = Outbox(bus, Address(), "tracking")
+        with serving(address) as router:
+            stack.enter_context(bridged(hub, router))
+        with serving(address) as router, ros(router) as node:
+            poses = node.hears("/fieldpose/pose", POSE)
+            until(lambda: poses, lambda: tracking.publish(STATE, state()))
+            assert "/fieldpose/pose" in node.topics()
+
+
 def test_images_and_guesses_of_a_ros_node_reach_the_pipeline() -> None:
     options = ("--topics.image", "/front/image_raw", "--topics.prior", "/arm/pose")
     with serving() as hub, serving() as router, bridged(hub, router, *options), joined(hub) as bus, ros(router) as node:
@@ -455,9 +483,7 @@ def camera_info() -> Any:
 
 def test_a_bridge_of_plain_keys_sends_cdr_under_the_topics_names() -> None:
     keys = ("--keys", "ros2dds")
-    with (
-        serving() as hub, serving() as router, bridged(hub, router, *keys), joined(hub) as bus, joined(router) as listener
-    ):  # fmt: skip
+    with serving() as hub, serving() as dds, bridged(hub, dds, *keys), joined(hub) as bus, joined(dds) as listener:
         heard: list[bytes] = []
         subscription = listener.subscribe("fieldpose/pose", lambda key, payload, at_ns: heard.append(payload), 8)
         tracking = Outbox(bus, Address(), "tracking")

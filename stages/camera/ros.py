@@ -64,6 +64,8 @@ def camera_of_info(message: Any, rectified: bool) -> Camera | None:
     cx, cy = float(matrix[2]), float(matrix[6 if rectified else 5])
     if fx == 0:
         return None
+    if matrix[1] != 0:
+        raise SourceError(f"its CameraInfo has a skew of {matrix[1]:g} px between the axes, which is not supported")
     lens, model = ([], "") if rectified else ([float(v) for v in _field(message, "d")], str(message.distortion_model))
     region, size = message.roi, (int(message.width), int(message.height))
     if region.width and region.height:
@@ -72,9 +74,9 @@ def camera_of_info(message: Any, rectified: bool) -> Camera | None:
     width, height = (n // b for n, b in zip(size, bins, strict=True))
     try:
         camera = camera_of((width * bins[0], height * bins[1]), (fx, fy), (cx, cy), lens, model)
+        return camera if bins == (1, 1) else camera.resized(width, height)
     except ValueError as error:
         raise SourceError(f"its CameraInfo cannot be used: {error}") from error
-    return camera if bins == (1, 1) else camera.resized(width, height)
 
 
 def info_topic(image_topic: str) -> str:

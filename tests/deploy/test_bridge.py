@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -274,6 +275,18 @@ def test_what_cannot_be_bridged_is_one_line(capsys: pytest.CaptureFixture[str]) 
         said = capsys.readouterr().err
         assert said.startswith(f"fieldpose: no router of ROS at {nobody}; start rmw_zenohd there")
         assert said.count("\n") == 1
+
+
+def test_without_rosbags_it_says_what_to_install(tmp_path: Path) -> None:
+    program = """
+import sys
+sys.modules["rosbags"] = None
+from fieldpose.deploy.cli import main
+sys.exit(main(["bridge", "ros2", "--connect", "tcp/127.0.0.1:1", "--router", "tcp/127.0.0.1:2"]))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr == "fieldpose: the bridge needs rosbags and xxhash; pip install 'fieldpose[ros]'\n"
 
 
 def test_the_length_of_a_unit_is_the_fields_own(tmp_path: Path) -> None:

@@ -264,6 +264,8 @@ def test_lenses_that_are_not_supported_are_refused_by_name(tmp_path: Path) -> No
                 info(model="rational_polynomial", d=[*D, 0.0, 0.2, 0.0]),
                 "k5 of OpenCV's rational model are not supported",
             ),
+            (info(k=[K[0], 0.5, *K[2:]]), "has a skew of 0.5 px between the axes"),
+            (info(bins=100), "its CameraInfo cannot be used"),
             (info(model="thin_prism", d=D), "distortion model 'thin_prism' is not known"),
             (info(size=(16, 12)), "are 8x6, but /front/camera_info is of 16x12; give --camera.camera-file"),
         ]

@@ -66,7 +66,7 @@ class RosBridge:
             raise ConfigError(f"pipeline {address.pair}: expected one, without *; start a bridge for each")
         self._bus, self._address, self._node, self._messages = bus, address, node, messages
         self._throttle = Throttle(stage_logger("bridge"))
-        self._numbers = _Numbers()
+        self._numbers = NextFrame()
         self._camera: Camera | None = None
         self._images = 0
         self._frames, self._guesses = Outbox(bus, address, "camera"), Outbox(bus, address, "bridge")
@@ -165,8 +165,8 @@ class RosBridge:
         return sink
 
 
-class _Numbers:
-    """The next frame's number, by those that have come: each source counts in its own steps."""
+class NextFrame:
+    """The number of the frame after the newest, by the last step between two; None before any has come."""
 
     def __init__(self) -> None:
         self.next: int | None = None

@@ -36,6 +36,7 @@ from fieldpose.bus.protocol import Closer
 from fieldpose.bus.ros2 import RosNames, RosTopic, attachment, gid_of
 from fieldpose.bus.topics import FRAME, PRIOR, STATE, Address
 from fieldpose.bus.transport import ZenohBus, serve_hub
+from fieldpose.deploy.bridges.ros2 import NextFrame
 from fieldpose.deploy.bridges.ros_messages import (
     BODY_FROM_OPTICAL,
     DIAGNOSTICS,
@@ -58,7 +59,9 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 CAPTURE_NS = 1_700_000_000_123_456_789
 HASHES = {
     POSE: "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
+    ODOMETRY: "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0",
     TF: "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    DIAGNOSTICS: "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e",
 }
 WAIT_S = 20.0
 CAM_FROM_OBJECT = on_sphere(30, 40)
@@ -247,6 +250,17 @@ def test_the_attachment_is_read_by_another_implementation() -> None:
     assert gid_of("").hex() == "7f498d4624c30160d8984701d306aa99"
 
 
+def test_a_guess_is_for_the_frame_after_the_newest() -> None:
+    numbers = NextFrame()
+    assert numbers.next is None
+    told = []
+    for number in (4, 5, 10, 15, 0):
+        numbers.seen(number)
+        told.append(numbers.next)
+    # A source that sends every fifth frame, and one that has started again.
+    assert told == [5, 6, 15, 20, 1]
+
+
 def test_names_are_resolved_and_checked() -> None:
     assert RosNames(namespace="/robot").resolved("cam/pose") == "/robot/cam/pose"
     assert RosNames(namespace="/robot").resolved("/tf") == "/tf"
@@ -275,6 +289,9 @@ def test_what_cannot_be_bridged_is_one_line(capsys: pytest.CaptureFixture[str]) 
         said = capsys.readouterr().err
         assert said.startswith(f"fieldpose: no router of ROS at {nobody}; start rmw_zenohd there")
         assert said.count("\n") == 1
+        with serving() as router:
+            assert main(["bridge", "ros2", "--connect", hub, "--router", router, "--object", "*"]) == 2
+            assert "pipeline */camera0: expected one, without *" in capsys.readouterr().err
 
 
 def test_without_rosbags_it_says_what_to_install(tmp_path: Path) -> None:

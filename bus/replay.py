@@ -142,6 +142,21 @@ def info(path: Path | str) -> RecordingInfo:
     )
 
 
+def of_another_program(path: Path | str) -> str | None:
+    """What an MCAP file holds that is no recording of ours, in words; None for one that is, or is empty or damaged.
+
+    Raises RecordingError for a file that cannot be read as MCAP.
+    """
+    with _reader(path) as reader:
+        summary, profile = reader.get_summary(), reader.get_header().profile
+    if summary is None or not summary.channels or any(topic_of(c.topic) for c in summary.channels.values()):
+        return None
+    names = {record.id: record.name for record in summary.schemas.values()}
+    held = {c.topic: names.get(c.schema_id, c.message_encoding) for c in summary.channels.values()}
+    topics = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(held.items()))
+    return f"a recording of {profile or 'another program'}, with {topics}"
+
+
 def read_attachment(path: Path | str, name: str) -> bytes:
     """The bytes of an attachment. Raises RecordingError where there is none of that name."""
     with _reader(path) as reader:

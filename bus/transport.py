@@ -1,4 +1,4 @@
-"""The bus between processes and hosts, over Zenoh, which only this module and `questions` know."""
+"""The bus between processes and hosts, over Zenoh, which only this module, `questions` and `ros2` know."""
 
 from __future__ import annotations
 
@@ -53,18 +53,18 @@ class ZenohBus:
     def __init__(
         self, hub: str = LOCAL_HUB, listen: str = _LOCAL_PEER, settings: Mapping[str, Any] | None = None
     ) -> None:
-        self._hub = _endpoint(hub)
+        self._hub = checked_endpoint(hub)
         peer = {
             "mode": "peer",
             "connect/endpoints": [self._hub],
             "connect/timeout_ms": -1,
             "connect/exit_on_failure": False,
             "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
-            "listen/endpoints": [_endpoint(listen)],
+            "listen/endpoints": [checked_endpoint(listen)],
             "transport/shared_memory/transport_optimization/pool_size": _POOL_BYTES,
             "transport/shared_memory/transport_optimization/enabled": _shared_memory_fits(),
         }
-        self._session = _open({**peer, **(settings or {})}, f"cannot use hub {hub} and listen on {listen}")
+        self._session = open_session({**peer, **(settings or {})}, f"cannot use hub {hub} and listen on {listen}")
         self._publishers: dict[str, Any] = {}
         self._declaring = threading.Lock()
         self._mine: list[Closer] = []
@@ -90,13 +90,13 @@ class ZenohBus:
                     self._publishers[key] = publisher
             publisher.put(payload)
         except zenoh.ZError as error:
-            raise TransportError(f"cannot send on {key}: {_reason(error)}") from error
+            raise TransportError(f"cannot send on {key}: {zenoh_reason(error)}") from error
 
     def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:
         channel: Any = zenoh.handlers.RingChannel(1) if capacity == 1 else zenoh.handlers.FifoChannel(capacity)
         subscriber = self._session.declare_subscriber(key, channel)
         # Zenoh's channel keeps the newest while Python is busy; copying out at once frees shared memory.
-        thread = threading.Thread(target=_feed, args=(subscriber.handler, sink), name=f"feed {key}", daemon=True)
+        thread = threading.Thread(target=feed, args=(subscriber.handler, sink), name=f"feed {key}", daemon=True)
         thread.start()
 
         def end() -> None:
@@ -125,7 +125,7 @@ class ZenohBus:
             try:
                 replies = asked(self._session, key, payload, max(deadline - time.monotonic(), _LEAST_S))
             except zenoh.ZError as error:
-                raise TransportError(f"cannot ask {key}: {_reason(error)}") from error
+                raise TransportError(f"cannot ask {key}: {zenoh_reason(error)}") from error
             if replies is not None:
                 return replies
             if time.monotonic() > deadline:
@@ -163,7 +163,7 @@ class ZenohBus:
             try:
                 voice.put(word)
             except zenoh.ZError as error:
-                raise TransportError(f"cannot send on the bus: {_reason(error)}") from error
+                raise TransportError(f"cannot send on the bus: {zenoh_reason(error)}") from error
 
         presence = Presence(name, say)
         self.subscribe("peers/*", lambda key, payload, _: presence.heard(key.rsplit("/", 1)[1], payload), 256)
@@ -183,7 +183,8 @@ class ZenohBus:
         return closer
 
 
-def _feed(channel: Any, sink: Sink) -> None:
+def feed(channel: Any, sink: Sink) -> None:
+    """Give the samples of a subscriber's channel to `sink`, until the channel ends."""
     while True:
         try:
             sample = channel.recv()
@@ -201,10 +202,10 @@ def serve_hub(
 
     Raises TransportError where it cannot listen, as on a port in use.
     """
-    router = {"mode": "router", "listen/endpoints": [_endpoint(listen)]}
+    router = {"mode": "router", "listen/endpoints": [checked_endpoint(listen)]}
     what = f"no hub at {listen}: is another one running there, or another program? Choose a free port"
     with StopSignals(stop) as signals:
-        session = _open({**router, **(settings or {})}, what)
+        session = open_session({**router, **(settings or {})}, what)
         try:
             signals.stop.wait()
         finally:
@@ -223,7 +224,8 @@ def log_to_stderr(level: str = "error") -> None:
     zenoh.init_log_from_env_or(level)
 
 
-def _open(values: Mapping[str, Any], what: str) -> Any:
+def open_session(values: Mapping[str, Any], what: str) -> Any:
+    """A session of Zenoh with these values in its configuration, by path. Raises TransportError, begun with `what`."""
     common = {
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": True,
@@ -239,10 +241,11 @@ def _open(values: Mapping[str, Any], what: str) -> Any:
             config.insert_json5(path, json.dumps(value))
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise TransportError(f"{what}: {_reason(error)}") from error
+        raise TransportError(f"{what}: {zenoh_reason(error)}") from error
 
 
-def _endpoint(text: str) -> str:
+def checked_endpoint(text: str) -> str:
+    """The address, where it has the form of one. Raises TransportError."""
     if not _ENDPOINT.fullmatch(text):
         raise TransportError(f"{text!r} is no address of a hub; expected for instance {LOCAL_HUB}")
     return text
@@ -256,6 +259,6 @@ def _shared_memory_fits() -> bool:
         return False
 
 
-def _reason(error: Exception) -> str:
+def zenoh_reason(error: Exception) -> str:
     """Zenoh's message without the places in its source."""
     return re.sub(r" at /\S+", "", str(error)).strip()

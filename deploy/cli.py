@@ -29,6 +29,7 @@ COMMANDS = {
     "stage": "one process of the pipeline, for another host or a debugger",
     "record": "record a pipeline that is running",
     "control": "reset the tracking of a pipeline that is running, give it a guess, or ask how it is",
+    "bridge": "a running pipeline as a node of ROS 2: poses, transforms, diagnostics",
     "replay": "run the pipeline again on a recording's frames and compare the poses",
     "info": "what a recording holds, topic by topic, and what it lacks; what a field says of itself",
     "poses": "a recording's poses for other programs: TUM's trajectories, COLMAP's models, CSV",

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+
 import cv2
 import numpy as np
+from PIL import Image
 
 from fieldpose.errors import GeometryError
 from fieldpose.stages.geometry import Camera, shrunk_size
@@ -40,6 +43,15 @@ def decoded(encoding: str, image: np.ndarray, width: int, height: int) -> np.nda
     if bgr is None or bgr.shape[:2] != (height, width):
         return None
     return cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB)
+
+
+def encoded_size(image: np.ndarray) -> tuple[int, int] | None:
+    """Width and height by the head of a jpeg or png file's bytes (n,) uint8; None where they are none."""
+    try:
+        with Image.open(io.BytesIO(image.tobytes()), formats=("JPEG", "PNG")) as opened:
+            return opened.size
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+        return None
 
 
 def checked_image(image: np.ndarray) -> None:

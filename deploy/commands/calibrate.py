@@ -36,7 +36,8 @@ class Options:
     """
 
     source: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="SOURCE", help_behavior_hint="")] = None
-    """A video file, a folder of photographs, or a source as `run` takes it (video:FILE, mcap:FILE, camera:0)."""
+    """A video file, a folder of photographs, or a source as `run` takes it (video:FILE, mcap:FILE, bag:FILE of ROS,
+    camera:0)."""
     out: Path | None = None
     """The camera file to write (.json)."""
     print_board: Path | None = None

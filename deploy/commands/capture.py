@@ -38,7 +38,8 @@ class Options:
     """
 
     source: tyro.conf.Positional[str]
-    """A video file, a folder of photographs, or a source as `run` takes it (video:FILE, mcap:FILE, camera:0)."""
+    """A video file, a folder of photographs, or a source as `run` takes it (video:FILE, mcap:FILE, bag:FILE of ROS,
+    camera:0)."""
     out: Path
     """The folder to write; it is to be empty or not there."""
     most: int = 150

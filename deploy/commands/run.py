@@ -45,8 +45,9 @@ class Options:
     ] = ()
     """The field (.safetensors) of the object or scene; of several objects FILE or NAME=FILE each."""
     source: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
-    """folder:DIR, dataset:DIR:test, video:FILE, camera:0 or mcap:FILE; bus: other programs send the frames, see
-    examples/; once for each of several cameras, as SOURCE or NAME=SOURCE (of one short for --camera.source)."""
+    """folder:DIR, dataset:DIR:test, video:FILE, camera:0, mcap:FILE or bag:FILE (of ROS); bus: other programs send the
+    frames, see examples/; once for each of several cameras, as SOURCE or NAME=SOURCE (of one short for
+    --camera.source)."""
     record: Path | None = None
     """Record every message into this file (.mcap)."""
     json: Path | None = None

@@ -78,6 +78,16 @@ def read_camera_file(path: Path) -> Camera:
         raise SourceError(f"{path}: no usable camera file ({why}); {_EXPECTED}") from error
 
 
+def camera_of(
+    size: Sequence[int], focal: Sequence[float], principal: Sequence[float], coefficients: Sequence[float], model: str
+) -> Camera:
+    """A camera of width and height, intrinsics in pixels and coefficients in OpenCV's order; model: as ROS names it.
+
+    Raises GeometryError or ValueError for what makes no camera, and for lenses that are not supported, by their name.
+    """
+    return _camera(_Numbers(size, focal, principal, coefficients, model))
+
+
 def _numbers(path: Path, content: bytes) -> _Numbers:
     if len(content) > _LARGEST_BYTES:
         raise ValueError(f"it has more than {_LARGEST_BYTES} bytes")

@@ -16,7 +16,8 @@ class CameraConfig:
     """A source, its calibration, and the pace at which its frames are sent."""
 
     source: str
-    """folder:DIR, dataset:DIR:test, video:FILE, camera:0, mcap:FILE, or bus for frames that other programs send."""
+    """folder:DIR, dataset:DIR:test, video:FILE, camera:0, mcap:FILE, bag:FILE (of ROS; bag:FILE#TOPIC where it has
+    several), or bus for frames that other programs send."""
     size: int | None = None
     """Shrink images whose longer side has more pixels than this."""
     holdout: Literal["auto", "odd", "every8"] = "auto"

@@ -77,6 +77,7 @@ def test_each_command_describes_itself_with_an_example(name: str, capsys: pytest
         (["convert", "nothing", "out"], "--to"),
         (["convert", "nothing", ".", "--to", "gltf"], "--to"),
         (["train", "nothing", "--out", "f.safetensors"], "nothing: no such folder"),
+        (["bridge", "ros2", "--connect", "tcp/127.0.0.1:7447"], "--router"),
         (["stage", "pnp", "--connect", "nowhere"], "'nowhere' is no address of a hub"),
         (["stage", "pnp", "--pipelines", "nothing.json"], "nothing.json: no such configuration file"),
         (["stage", "pnp", "--config", "nothing.toml"], "nothing.toml: no such configuration file"),

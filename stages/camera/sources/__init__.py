@@ -9,6 +9,7 @@ from fieldpose.errors import SourceError
 from fieldpose.stages.camera.calibration import Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import Source
+from fieldpose.stages.camera.sources.bag import open_bag
 from fieldpose.stages.camera.sources.dataset import open_dataset
 from fieldpose.stages.camera.sources.device import open_device
 from fieldpose.stages.camera.sources.folder import open_folder
@@ -33,6 +34,7 @@ KINDS: dict[str, Kind] = {
     "video": Kind(open_video, "video:FILE", True),
     "camera": Kind(open_device, "camera:0", True),
     "mcap": Kind(open_recording, "mcap:FILE", True, True),
+    "bag": Kind(open_bag, "bag:FILE", True),
 }
 
 

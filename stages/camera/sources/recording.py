@@ -11,7 +11,7 @@ import numpy as np
 from cachetools import FIFOCache
 
 from fieldpose.bus.messages import Frame, Truth
-from fieldpose.bus.replay import Recorded, read_recording
+from fieldpose.bus.replay import Recorded, of_another_program, read_recording
 from fieldpose.bus.topics import FRAME, TRUTH, Address, key_matches
 from fieldpose.errors import RecordingError, SourceError
 from fieldpose.stages.camera.calibration import Calibrator
@@ -27,9 +27,10 @@ _TRUTHS_KEPT = 64
 def open_recording(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
     """mcap:FILE, which holds its cameras: config.recorded says whose frames, where these are several.
 
-    Raises SourceError for one without frames of it.
+    Raises SourceError for one without frames of it, and for one of another program.
     """
     wanted = None if config.recorded is None else _address(config.recorded)
+    _refuse_others(rest)
 
     def frames(first: int) -> Iterator[CapturedFrame]:
         return islice(_frames(rest, config.size, wanted), first, None)
@@ -38,6 +39,15 @@ def open_recording(rest: str, config: CameraConfig, calibrator: Calibrator) -> S
         which = "" if config.recorded is None else f" of {config.recorded}"
         raise SourceError(f"{rest}: no camera frames{which} in this recording; `fieldpose info` lists what it has")
     return Source(f"recording {rest}", "own", frames)
+
+
+def _refuse_others(path: str) -> None:
+    try:
+        held = of_another_program(path)
+    except RecordingError as error:
+        raise SourceError(str(error)) from error
+    if held is not None:
+        raise SourceError(f"{path}: is {held}; --source bag:{path} reads the images of ROS' bags")
 
 
 def _address(recorded: str) -> Address:

@@ -431,7 +431,7 @@ def test_a_dataset_that_is_none_is_an_error_of_the_dataset(tmp_path: Path) -> No
 
 
 def test_which_sources_are_videos() -> None:
-    assert {name for name, kind in KINDS.items() if kind.is_video} == {"video", "camera", "mcap"}
+    assert {name for name, kind in KINDS.items() if kind.is_video} == {"video", "camera", "mcap", "bag"}
     assert is_video("mcap:a.mcap")
     assert not is_video("folder:photos")
 

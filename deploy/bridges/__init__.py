@@ -1,0 +1,1 @@
+"""Bridges between a running pipeline and other systems."""

@@ -117,6 +117,16 @@ def read_recording(path: Path | str, topics: Container[Topic[Any]] | None = None
         yield Recorded(payload.key, topic, message, payload.log_time_ns)
 
 
+def recorded_at(path: Path | str, topic: Topic[Any], key: str, log_time_ns: int) -> Iterator[Recorded]:
+    """The messages under a key that were received at a time. Raises RecordingError as read_recording does."""
+    with _reader(path) as reader:
+        for _, _, message in reader.iter_messages([key], starting_at=log_time_ns, ending_at=log_time_ns):
+            try:
+                yield Recorded(key, topic, decode(message.data, topic.message_type, topic.max_bytes), message.log_time)
+            except CodecError as error:
+                raise RecordingError(f"{path}: a message on {key} cannot be read: {error}") from error
+
+
 def info(path: Path | str) -> RecordingInfo:
     """What a recording holds. Raises RecordingError for a file that is no whole recording."""
     times: dict[str, list[int]] = {}

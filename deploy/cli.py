@@ -26,6 +26,7 @@ COMMANDS = {
     "train": "posed images -> a field (.safetensors)",
     "estimate": "one image, in one process, without a bus",
     "run": "the pipeline: a source of images through every stage, each a process",
+    "view": "a page that shows a running pipeline, or a recording",
     "stage": "one process of the pipeline, for another host or a debugger",
     "record": "record a pipeline that is running",
     "control": "reset the tracking of a pipeline that is running, give it a guess, or ask how it is",

@@ -19,6 +19,7 @@ from fieldpose.deploy.reporting.report import live_line, print_summary
 from fieldpose.deploy.reporting.results import RunResult, summarise
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import Settings
+from fieldpose.deploy.viewing.beside import page_beside
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class Options:
     """The folder to write into."""
     json: Path | None = None
     """Write the figures into this file too."""
+    view: bool = False
+    """Serve a page that shows the run while it lasts, and print its address; see `fieldpose view`."""
     video: bool = True
     """Write overlay.jpg and overlay.mp4."""
     logs: Path | None = None
@@ -52,8 +55,8 @@ class Options:
         check_writable(recording, self.json)
         camera = replace(self.settings.camera, source=f"mcap:{sequence}")
         plan = planned(replace(self.settings, camera=camera), field)
-        with live_line("demo") as report:
-            (outcome,) = run_pipelines(Run((plan,), recording, logs=self.logs), report)
+        with page_beside((plan,), None, self.view) as hub, live_line("demo") as report:
+            (outcome,) = run_pipelines(Run((plan,), recording, hub, self.logs), report)
         written = [recording, self.out / "summary.json"]
         summary = summarise(outcome)
         print_summary(summary, "demo")

@@ -17,6 +17,7 @@ from fieldpose.deploy.reporting.results import RunResult, summarise, to_csv
 from fieldpose.deploy.reporting.trajectories import PoseFiles, Trajectory, in_words
 from fieldpose.deploy.rig import planned_rig, read_rig
 from fieldpose.deploy.settings import Settings, overridden
+from fieldpose.deploy.viewing.beside import page_beside
 from fieldpose.stages.camera.config import Pace
 from fieldpose.stages.nerf.field import load_field
 from fieldpose.stages.nerf.training_views import training_views
@@ -83,6 +84,8 @@ class Options:
     """xfeat, xfeat-lighterglue, aliked-lightglue, disk-lightglue, loftr or sift (short for --matching.matcher)."""
     refine: Literal["auto", "always", "never"] | None = None
     """Whether to refine poses by colours; auto: not in videos (short for --refinement.when)."""
+    view: bool = False
+    """Serve a page that shows the run while it lasts, and print its address; see `fieldpose view`."""
     listen: str | None = None
     """Address of the hub, for instance tcp/0.0.0.0:7447 (default: a free port of this machine)."""
     logs: Path | None = None
@@ -109,8 +112,9 @@ class Options:
         files = [self._pose_files(plan, len(plans) > 1) for plan in plans]
         for file in files:
             file.check()
-        with live_line(titles[0] if len(plans) == 1 else f"{len(plans)} pipelines") as report:
-            outcomes = run_pipelines(Run(plans, self.record, self.listen, self.logs), report)
+        named = titles[0] if len(plans) == 1 else f"{len(plans)} pipelines"
+        with page_beside(plans, self.listen, self.view) as hub, live_line(named) as report:
+            outcomes = run_pipelines(Run(plans, self.record, hub, self.logs), report)
         figures = {}
         for plan, title, outcome in zip(plans, titles, outcomes, strict=True):
             pair = plan.settings.address.pair

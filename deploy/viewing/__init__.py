@@ -1,0 +1,1 @@
+"""A page that shows a pipeline at work, live or from its recording."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fieldpose.bus.messages import CameraInfo, Frame, Header, Message, Reason, State, Truth
-from fieldpose.bus.replay import info, read_recording
+from fieldpose.bus.replay import RecordingInfo, info, read_recording
 from fieldpose.bus.topics import CAMERA_INFO, FRAME, GUESS, STATE, TRUTH, Address, Topic
 from fieldpose.deploy.graph import BETWEEN_STAGES, CAMERA
 from fieldpose.deploy.reporting.results import FrameResult, Outcome, TruthKnown
@@ -37,13 +38,14 @@ class _Seen:
 
 
 class Gathering:
-    """Everything about the frames of one pipeline; the newest 100,000 are kept.
+    """Everything about the frames of one pipeline, of which the newest are kept.
 
     object_from_dataset: into the frame that poses are in; true ones are in that of the dataset.
     """
 
-    def __init__(self, object_from_dataset: Similarity | None = None) -> None:
+    def __init__(self, object_from_dataset: Similarity | None = None, kept: int = _FRAMES_KEPT) -> None:
         self._object_from_dataset = object_from_dataset or Similarity.identity()
+        self._kept = kept
         self._frames: OrderedDict[tuple[int, int], _Seen] = OrderedDict()
 
     def note_header(self, topic: Topic[Any], header: Header) -> None:
@@ -69,6 +71,10 @@ class Gathering:
         """What became of each frame that the camera has sent, oldest first."""
         return [_result(frame_id, self._frames[at_ns, frame_id]) for at_ns, frame_id in sorted(self._frames)]
 
+    def result(self, header: Header) -> FrameResult:
+        """What has become so far of the frame that a message is of."""
+        return _result(header.frame_id, self._seen(header))
+
     def _in_frame(self, pose: np.ndarray | None) -> np.ndarray | None:
         known = _copied(pose)
         return None if known is None else self._object_from_dataset.of_poses(known[None])[0]
@@ -79,7 +85,7 @@ class Gathering:
         seen = self._frames.get(key)
         if seen is None:
             seen = self._frames[key] = _Seen(header.capture_ns)
-            if len(self._frames) > _FRAMES_KEPT:
+            if len(self._frames) > self._kept:
                 self._frames.popitem(last=False)
         return seen
 
@@ -92,13 +98,10 @@ def recorded_results(
     object_from_dataset: see Gathering.
     Raises RecordingError for a recording without states, and UsageError where the pipeline is not one of several.
     """
-    found = [STATE.address_of(topic.key) for topic in info(path).topics if topic.topic == STATE.name]
-    addresses = {address.pair: address for address in found if address is not None}
+    addresses = _addresses(info(path), (STATE,))
     if not addresses:
         raise RecordingError(f"{path}: holds no poses, since nothing of the topic {STATE.name} was recorded")
-    if pipeline not in addresses and (pipeline is not None or len(addresses) > 1):
-        raise UsageError(f"{path}: holds the pipelines {', '.join(sorted(addresses))}; choose one with --pipeline")
-    address = addresses[pipeline or next(iter(addresses))]
+    address = _chosen(path, addresses, pipeline)
     gathering = Gathering(object_from_dataset)
     for recorded in read_recording(path, (*TIMED, CAMERA_INFO, TRUTH, STATE)):
         if address.covers(recorded.key):
@@ -106,6 +109,31 @@ def recorded_results(
                 gathering.note_header(recorded.topic, recorded.message.header)
             gathering.note(recorded.message)
     return address, gathering.results()
+
+
+def recorded_pipeline(path: Path, pipeline: str | None = None) -> Address:
+    """The address of a recorded pipeline, OBJECT/CAMERA where there are several; of a camera, where nothing else is.
+
+    Raises RecordingError for a recording without messages, and UsageError where the pipeline is not one of several.
+    """
+    recording = info(path)
+    for topics in ((STATE,), (TRUTH, *BETWEEN_STAGES), (FRAME, CAMERA_INFO)):
+        addresses = _addresses(recording, topics)
+        if addresses:
+            return _chosen(path, addresses, pipeline)
+    raise RecordingError(f"{path}: holds neither frames nor poses; `fieldpose info` lists what it has")
+
+
+def _addresses(recording: RecordingInfo, topics: Sequence[Topic[Any]]) -> dict[str, Address]:
+    """OBJECT/CAMERA -> address, of all that has sent on some topics."""
+    found = (topic.address_of(held.key) for topic in topics for held in recording.topics)
+    return {address.pair: address for address in found if address is not None}
+
+
+def _chosen(path: Path, addresses: Mapping[str, Address], pipeline: str | None) -> Address:
+    if pipeline not in addresses and (pipeline is not None or len(addresses) > 1):
+        raise UsageError(f"{path}: holds the pipelines {', '.join(sorted(addresses))}; choose one with --pipeline")
+    return addresses[pipeline or next(iter(addresses))]
 
 
 def _result(frame_id: int, seen: _Seen) -> FrameResult:

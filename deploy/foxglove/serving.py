@@ -32,10 +32,10 @@ class Server:
     def __init__(self, host: str, port: int, name: str, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._shown_at: dict[Channel, float] = {}
-        context = foxglove.Context()
-        self._channels = {channel: _served(channel, context) for channel in channels.ALL}
+        self._context = foxglove.Context()  # the server and the channels do not keep it
+        self._channels = {channel: _served(channel, self._context) for channel in channels.ALL}
         try:
-            self._server = foxglove.start_server(name=name, host=host, port=port, context=context)
+            self._server = foxglove.start_server(name=name, host=host, port=port, context=self._context)
         except (RuntimeError, OverflowError) as error:
             why = str(error).removeprefix("FoxgloveError: ")
             raise TransportError(f"cannot serve on {host}:{port}: {why}; choose others with --host, --port") from error

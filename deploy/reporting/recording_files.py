@@ -70,12 +70,15 @@ class RecordingFiles:
 
     def _video(self, path: Path) -> str:
         from fieldpose.deploy.reporting.showing import pictures, write_video
+        from fieldpose.stages.nerf.field import load_metadata
         from fieldpose.stages.nerf.loading import load_renderer
 
-        address, results = recorded_results(self.recording, self.pipeline)
+        address = recorded_pipeline(self.recording, self.pipeline)
         with self._field_of(address) as found:
             if found is None:
                 raise RecordingError(f"{self.recording}: holds no field to lay over its images; give --field FIELD")
+            moved = load_metadata(found).frame.object_from_dataset
+            _, results = recorded_results(self.recording, self.pipeline, moved)
             renderer = load_renderer(found, threads=self.threads, backend=self.backend)
         with progress_bar("export") as report:
             shown = pictures(

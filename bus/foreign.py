@@ -43,7 +43,7 @@ class ForeignWriter:
     def __enter__(self) -> ForeignWriter:
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream = open(self._partial, "wb")  # noqa: SIM115 - closed by `__exit__`
+            self._stream = open(self._partial, "wb")
         except OSError as error:
             raise self._failure(error) from error
         self._writer = Writer(self._stream, compression=CompressionType.ZSTD)

@@ -12,7 +12,6 @@ import numpy as np
 import tyro
 
 from fieldpose.deploy.reporting.output import write_bytes
-from fieldpose.deploy.reporting.recording_files import RecordingFiles
 from fieldpose.deploy.reporting.surfaces import check_surface, glb, ply
 from fieldpose.deploy.reporting.turntable import check_video, write_turntable
 from fieldpose.errors import FieldFileError, UsageError
@@ -98,6 +97,8 @@ class Options:
 
     def _recording(self) -> int:
         self._refuse(RECORDING_SUFFIX, mesh=self.mesh, points=self.points, turntable=self.turntable)
+        from fieldpose.deploy.reporting.recording_files import RecordingFiles
+
         files = RecordingFiles(
             self.file, self.foxglove, self.layout, self.video, self.field, self.pipeline, self.backend, self._threads()
         )

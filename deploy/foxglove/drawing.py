@@ -84,7 +84,7 @@ def calibration(camera: Camera, frame: str, at_ns: int) -> messages.CameraCalibr
 
 
 def image(pixels: np.ndarray, encoding: Encoding, frame: str, at_ns: int) -> messages.CompressedImage:
-    """pixels: (h, w, 3) uint8 RGB, which becomes a JPEG, or the bytes (n,) of a file, which stay. Raises OutputError."""
+    """pixels: (h, w, 3) uint8 RGB, which become a JPEG, or the bytes (n,) of a file, which stay. Raises OutputError."""
     content, kind = pixels, encoding
     if encoding == "rgb8":
         written, content = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))

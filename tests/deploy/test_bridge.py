@@ -46,7 +46,7 @@ def hub() -> Iterator[str]:
 
 @contextmanager
 def client_of(port: int) -> Iterator[Client]:
-    with connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None) as socket:  # type: ignore[list-item]
+    with connect(f"ws://127.0.0.1:{port}", subprotocols=["foxglove.sdk.v1"], max_size=None) as socket:
         assert socket.subprotocol == "foxglove.sdk.v1"
         client = Client(socket)
         client.wait_for_channels(ENOUGH_S)

@@ -25,6 +25,7 @@ from fieldpose.bus.topics import Address, Topic
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.foxglove import channels
 from fieldpose.deploy.foxglove.converter import Converted, Converter
+from fieldpose.deploy.foxglove.exporting import in_order
 from fieldpose.deploy.foxglove.layouts import LAYOUT
 from fieldpose.deploy.scene import demo_file
 from fieldpose.stages.geometry import Similarity, camera_centre, inverse, rotation_about
@@ -312,6 +313,15 @@ def test_the_way_so_far_is_bounded_and_told_once_a_second() -> None:
     assert len(told[-1].payload) - len(told[-2].payload) == 0
     again = state(0, TrackingState.TRACKING, pose=viewpoint())
     assert channels.PATH in [said.channel for said in converter.convert(topics.STATE, again)]
+
+
+def test_messages_are_in_the_order_of_their_frames() -> None:
+    times = [1, 2, 3, 2, 2, 9, 10, 4, 11, 3, 0]
+    given = [Converted(channels.STATE, bytes([i]), at * S, 0, i) for i, at in enumerate(times)]
+    ordered = list(in_order(iter(given)))
+    assert [message.log_ns // S for message in ordered] == [1, 2, 2, 2, 3, 4, 3, 0, 9, 10, 11]
+    assert [message.sequence for message in ordered[1:4]] == [1, 3, 4]
+    assert list(in_order(iter([]))) == []
 
 
 def test_only_what_is_wanted_is_made(monkeypatch: pytest.MonkeyPatch) -> None:

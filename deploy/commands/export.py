@@ -1,4 +1,4 @@
-"""What a field has learnt, as files that other programs read."""
+"""What a field has learnt, or a recording holds, as files that other programs read."""
 
 from __future__ import annotations
 
@@ -23,14 +23,18 @@ if TYPE_CHECKING:
     from fieldpose.stages.nerf.surface.extract import Region
     from fieldpose.stages.nerf.surface.mesh import SurfaceMesh, SurfacePoints
 
+RECORDING_SUFFIX = ".mcap"
 _RESOLUTIONS = 8, 2048
 
 
 @dataclass(frozen=True)
 class Options:
-    """Write a field's surface as a mesh or as points, with colours and normals, or a video of what was learnt.
+    """Write a field's surface as a mesh or as points, with colours and normals, or a video of what was learnt; or a
+    recording for Foxglove, Lichtblick and other readers of MCAP, or as a video with the field over its images.
 
     Example: fieldpose export out/lego.safetensors --mesh out/lego.glb --points out/lego.ply
+
+    Example: fieldpose export out/run.mcap --foxglove out/run-foxglove.mcap --layout out/layout.json
 
     The surface is made of what the training views see of the field, and is open where none has looked. Colours are the
     mean over these views, light and shade included. PLY files are in the object's own frame and unit. GLB files hold
@@ -39,8 +43,8 @@ class Options:
     gltf_from_object (4x4 by rows), and what was done in words.
     """
 
-    field: tyro.conf.Positional[Path]
-    """The field (.safetensors) of the object or scene."""
+    file: tyro.conf.Positional[Path]
+    """The field (.safetensors) of the object or scene, or the recording (.mcap) of a run."""
     mesh: Path | None = None
     """Write the surface as triangles into this file (.ply or .glb)."""
     points: Path | None = None
@@ -48,6 +52,16 @@ class Options:
     turntable: Path | None = None
     """Write a video of three seconds into this file (.mp4): around a bounded object that was seen from all sides, else
     to and fro along training views."""
+    foxglove: Path | None = None
+    """Write the recording into this file (.mcap) with Foxglove's schemas; needs pip install 'fieldpose[foxglove]'."""
+    layout: Path | None = None
+    """Write the layout that shows such a file into this one (.json), to be imported in Foxglove."""
+    video: Path | None = None
+    """Write a video (.mp4) of the recording: its frames, and beside them the same with the field over them."""
+    field: Path | None = None
+    """Of a recording: its field (.safetensors), where that is not attached or no longer where it was."""
+    pipeline: str | None = None
+    """Of a recording: OBJECT/CAMERA, which of its pipelines, where it holds several."""
     resolution: int = 384
     """Cells along the longest side of the region; parts thinner than one or two of them are lost."""
     region: tuple[float, float, float, float, float, float] | None = None
@@ -66,11 +80,13 @@ class Options:
 
     def run(self) -> int:
         """Write what was asked for, say what it is."""
+        if self.file.suffix == RECORDING_SUFFIX:
+            return self._recording()
         self._check()
         from fieldpose.stages.nerf.field import load_field
         from fieldpose.stages.nerf.loading import make_renderer
 
-        field = load_field(self.field)
+        field = load_field(self.file)
         metadata, renderer = field.metadata, make_renderer(field, self._threads(), self.backend)
         if self.mesh is not None or self.points is not None:
             self._surface(renderer, metadata)
@@ -79,8 +95,30 @@ class Options:
             print(f"{self.turntable}: {_megabytes(self.turntable)}")
         return 0
 
+    def _recording(self) -> int:
+        self._refuse(RECORDING_SUFFIX, mesh=self.mesh, points=self.points, turntable=self.turntable)
+        from fieldpose.deploy.reporting.recording_files import RecordingFiles
+
+        files = RecordingFiles(
+            self.file, self.foxglove, self.layout, self.video, self.field, self.pipeline, self.backend, self._threads()
+        )
+        files.check()
+        for line in files.write():
+            print(line)
+        return 0
+
+    def _refuse(self, suffix: str, **others: Path | str | None) -> None:
+        given = [f"--{name}" for name, value in others.items() if value is not None]
+        if given:
+            kind, other = ("recording", "field") if suffix == RECORDING_SUFFIX else ("field", "recording (.mcap)")
+            raise UsageError(f"{self.file} is taken for a {kind}, but {given[0]} is of a {other}")
+
     def _check(self) -> None:
         """Raise OutputError or UsageError before long work is begun."""
+        self._refuse(
+            self.file.suffix, foxglove=self.foxglove, layout=self.layout, video=self.video, field=self.field,
+            pipeline=self.pipeline,
+        )  # fmt: skip
         if self.mesh is None and self.points is None and self.turntable is None:
             raise UsageError("nothing to write; give --mesh, --points or --turntable")
         check_surface(self.mesh, (".ply", ".glb"), "a mesh")
@@ -140,7 +178,7 @@ class Options:
 
     def _check_found(self, surface: SurfacePoints) -> None:
         if not len(surface.points):
-            raise FieldFileError(f"{self.field}: no surface is seen in the region; give another one, or train longer")
+            raise FieldFileError(f"{self.file}: no surface is seen in the region; give another one, or train longer")
 
 
 def _in_unit(region: Region, metadata: FieldMetadata) -> str:

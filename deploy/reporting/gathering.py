@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fieldpose.bus.messages import CameraInfo, Frame, Header, Message, Reason, State, Truth
-from fieldpose.bus.replay import info, read_recording
+from fieldpose.bus.replay import RecordingInfo, info, read_recording
 from fieldpose.bus.topics import CAMERA_INFO, FRAME, GUESS, STATE, TRUTH, Address, Topic
 from fieldpose.deploy.graph import BETWEEN_STAGES, CAMERA
 from fieldpose.deploy.reporting.results import FrameResult, Outcome, TruthKnown
@@ -46,6 +47,7 @@ class Gathering:
     def __init__(self, object_from_dataset: Similarity | None = None, kept: int | None = FRAMES_KEPT) -> None:
         self._kept = kept
         self._object_from_dataset = object_from_dataset or Similarity.identity()
+        self._kept = kept
         self._frames: OrderedDict[tuple[int, int], _Seen] = OrderedDict()
 
     def note_header(self, topic: Topic[Any], header: Header) -> None:
@@ -71,6 +73,10 @@ class Gathering:
         """What became of each frame that the camera has sent, oldest first."""
         return [_result(frame_id, self._frames[at_ns, frame_id]) for at_ns, frame_id in sorted(self._frames)]
 
+    def result(self, header: Header) -> FrameResult:
+        """What has become so far of the frame that a message is of."""
+        return _result(header.frame_id, self._seen(header))
+
     def _in_frame(self, pose: np.ndarray | None) -> np.ndarray | None:
         known = _copied(pose)
         return None if known is None else self._object_from_dataset.of_poses(known[None])[0]
@@ -94,13 +100,10 @@ def recorded_results(
     object_from_dataset: see Gathering.
     Raises RecordingError for a recording without states, and UsageError where the pipeline is not one of several.
     """
-    found = [STATE.address_of(topic.key) for topic in info(path).topics if topic.topic == STATE.name]
-    addresses = {address.pair: address for address in found if address is not None}
+    addresses = _addresses(info(path), (STATE,))
     if not addresses:
         raise RecordingError(f"{path}: holds no poses, since nothing of the topic {STATE.name} was recorded")
-    if pipeline not in addresses and (pipeline is not None or len(addresses) > 1):
-        raise UsageError(f"{path}: holds the pipelines {', '.join(sorted(addresses))}; choose one with --pipeline")
-    address = addresses[pipeline or next(iter(addresses))]
+    address = _chosen(path, addresses, pipeline)
     gathering = Gathering(object_from_dataset, kept=None)
     for recorded in read_recording(path, (*TIMED, CAMERA_INFO, TRUTH, STATE)):
         if address.covers(recorded.key):
@@ -108,6 +111,31 @@ def recorded_results(
                 gathering.note_header(recorded.topic, recorded.message.header)
             gathering.note(recorded.message)
     return address, gathering.results()
+
+
+def recorded_pipeline(path: Path, pipeline: str | None = None) -> Address:
+    """The address of a recorded pipeline, OBJECT/CAMERA where there are several; of a camera, where nothing else is.
+
+    Raises RecordingError for a recording without messages, and UsageError where the pipeline is not one of several.
+    """
+    recording = info(path)
+    for topics in ((STATE,), (TRUTH, *BETWEEN_STAGES), (FRAME, CAMERA_INFO)):
+        addresses = _addresses(recording, topics)
+        if addresses:
+            return _chosen(path, addresses, pipeline)
+    raise RecordingError(f"{path}: holds neither frames nor poses; `fieldpose info` lists what it has")
+
+
+def _addresses(recording: RecordingInfo, topics: Sequence[Topic[Any]]) -> dict[str, Address]:
+    """OBJECT/CAMERA -> address, of all that has sent on some topics."""
+    found = (topic.address_of(held.key) for topic in topics for held in recording.topics)
+    return {address.pair: address for address in found if address is not None}
+
+
+def _chosen(path: Path, addresses: Mapping[str, Address], pipeline: str | None) -> Address:
+    if pipeline not in addresses and (pipeline is not None or len(addresses) > 1):
+        raise UsageError(f"{path}: holds the pipelines {', '.join(sorted(addresses))}; choose one with --pipeline")
+    return addresses[pipeline or next(iter(addresses))]
 
 
 def _result(frame_id: int, seen: _Seen) -> FrameResult:

@@ -93,3 +93,8 @@ class VideoFile:
         """Finish the file."""
         self._writer.release()
         os.replace(self._partial, self._path)
+
+    def discard(self) -> None:
+        """Give up what was written."""
+        self._writer.release()
+        self._partial.unlink()

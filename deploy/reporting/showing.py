@@ -11,7 +11,7 @@ import numpy as np
 
 from fieldpose.bus.messages import Frame
 from fieldpose.bus.replay import read_recording
-from fieldpose.bus.topics import FRAME
+from fieldpose.bus.topics import FRAME, Address
 from fieldpose.deploy.reporting.overlay import VideoFile, captioned, overlaid, without_distortion
 from fieldpose.deploy.reporting.results import FrameResult
 from fieldpose.errors import OutputError
@@ -37,14 +37,19 @@ def pictures(
     results: Sequence[FrameResult],
     renderer: RayRenderer,
     report: Callable[[int, int], None] = lambda done, total: None,
+    address: Address | None = None,
 ) -> Iterator[Picture]:
     """The recorded frames that were worked on, in order; those without a pose show the camera's image alone.
+
+    address: of the pipeline that the results are of, where the recording holds several.
 
     Raises RecordingError, and OutputError for a frame that cannot be decoded.
     """
     finished = {result.frame_id: result for result in results if result.outcome == "finished"}
     done = 0
     for recorded in read_recording(recording, (FRAME,)):
+        if address is not None and not address.covers(recorded.key):
+            continue
         frame = cast(Frame, recorded.message)
         result = finished.pop(frame.header.frame_id, None)
         if result is not None:
@@ -61,14 +66,19 @@ def write_video(path: Path, shown: Iterator[Picture]) -> Picture | None:
     video: VideoFile | None = None
     best: Picture | None = None
     before: Picture | None = None
-    for picture in shown:
-        if video is None:
-            video = VideoFile(path, _VIDEO_HZ, picture.pixels.shape[1], picture.pixels.shape[0])
-        if before is not None:
-            video.add(before.pixels, _repeats(before, picture))
-        before = picture
-        if best is None or picture.result.score > best.result.score:
-            best = picture
+    try:
+        for picture in shown:
+            if video is None:
+                video = VideoFile(path, _VIDEO_HZ, picture.pixels.shape[1], picture.pixels.shape[0])
+            if before is not None:
+                video.add(before.pixels, _repeats(before, picture))
+            before = picture
+            if best is None or picture.result.score > best.result.score:
+                best = picture
+    except BaseException:
+        if video is not None:
+            video.discard()
+        raise
     if video is not None and before is not None:
         video.add(before.pixels, 1)
         video.close()

@@ -72,6 +72,8 @@ def test_each_command_describes_itself_with_an_example(name: str, capsys: pytest
         (["stage", "cooking"], "'cooking'"),
         (["info", "nothing.mcap"], "nothing.mcap: cannot be read: No such file"),
         (["recover", "nothing.mcap"], "nothing.mcap: cannot be read"),
+        (["export", "nothing.mcap", "--foxglove", "a.mcap"], "nothing.mcap: cannot be read: No such file"),
+        (["bridge", "rviz"], "Unrecognized options: rviz"),
         (["run", "nothing.safetensors", "--source", "camera:0"], "nothing.safetensors: no such field file"),
         (["convert", "nothing", "out", "--to", "colmap"], "nothing: no such folder"),
         (["convert", "nothing", "out"], "--to"),

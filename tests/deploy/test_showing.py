@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from fieldpose.bus.topics import FRAME, Address
 from fieldpose.deploy.reporting.output import PICTURES, check_picture, check_writable, write_bytes, write_json
 from fieldpose.deploy.reporting.overlay import EDGE_RGB, encoded, overlaid
 from fieldpose.deploy.reporting.results import FrameResult, TruthKnown
-from fieldpose.deploy.reporting.showing import pictures, write_video
+from fieldpose.deploy.reporting.showing import Picture, pictures, write_video
 from fieldpose.deploy.reporting.timeline import plot_timeline, state_spans
 from fieldpose.errors import OutputError
 from fieldpose.stages.geometry import perturb
@@ -76,6 +77,27 @@ def test_a_video_shows_each_finished_frame_until_the_next(tmp_path: Path, scene:
     assert (video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (128, 64)
     assert video.get(cv2.CAP_PROP_FRAME_COUNT) == 3 + 3 + 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.mcap", "a.mp4"]
+
+
+def test_a_video_that_cannot_be_finished_leaves_nothing(tmp_path: Path, scene: AnalyticScene) -> None:
+    results = recorded(tmp_path / "a.mcap", scene, 4)
+
+    def broken() -> Iterator[Picture]:
+        yield from pictures(tmp_path / "a.mcap", results, scene)
+        raise OutputError("a frame cannot be decoded")
+
+    with pytest.raises(OutputError):
+        write_video(tmp_path / "a.mp4", broken())
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+
+
+def test_pictures_are_of_the_frames_of_the_pipelines_camera(tmp_path: Path, scene: AnalyticScene) -> None:
+    results = recorded(tmp_path / "a.mcap", scene, 3)
+    counts = [
+        len(list(pictures(tmp_path / "a.mcap", results, scene, address=address)))
+        for address in (None, Address(object="mug"), Address(camera="other"))
+    ]
+    assert counts == [2, 2, 0]
 
 
 def test_no_finished_frame_makes_no_video(tmp_path: Path) -> None:

@@ -309,7 +309,7 @@ sys.exit(main(["bridge", "ros2", "--connect", "tcp/127.0.0.1:1", "--router", "tc
 def test_the_length_of_a_unit_is_the_fields_own(tmp_path: Path) -> None:
     def metres(*options: object) -> float:
         arguments = ["ros2", "--connect", "a", "--router", "b", *(str(option) for option in options)]
-        return float(parse(bridge.Options, "bridge", arguments).metres_of_unit())
+        return float(parse(bridge.Options, "bridge", arguments).to.metres_of_unit())
 
     assert metres("--field", demo_file("field.safetensors")) == 0.1
     assert metres("--field", demo_file("field.safetensors"), "--metres", 2) == 2.0

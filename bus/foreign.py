@@ -1,0 +1,72 @@
+"""Writing MCAP files whose messages are another program's, of schemas that it knows."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+
+from mcap.writer import CompressionType, Writer
+
+from fieldpose.errors import OutputError
+
+
+class ForeignWriter:
+    """Writes PATH under a temporary name and gives it its own at the end; nothing is left where that was not reached.
+
+    Use it in a `with` statement. Raises OutputError where nothing can be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._partial = path.with_name(f"{path.stem}.partial{path.suffix}")
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+
+    def channel(self, topic: str, encoding: str, schema: tuple[str, str, bytes]) -> None:
+        """Announce a topic, how its messages are encoded, and the name, encoding and bytes of their schema."""
+        name, schema_encoding, data = schema
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(name, schema_encoding, data)
+        self._channels[topic] = self._writer.register_channel(topic, encoding, self._schemas[name])
+
+    def write(self, topic: str, payload: bytes, log_ns: int, publish_ns: int, sequence: int) -> None:
+        """Write an encoded message of a topic that was announced; times are nanoseconds since the epoch."""
+        self._writer.add_message(self._channels[topic], log_ns, payload, publish_ns, sequence % 2**32)
+
+    def add(self, name: str, values: Mapping[str, str]) -> None:
+        """Put in metadata."""
+        self._writer.add_metadata(name, dict(values))
+
+    def __enter__(self) -> ForeignWriter:
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._stream = open(self._partial, "wb")
+        except OSError as error:
+            raise self._failure(error) from error
+        self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
+        self._writer.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if error is None:
+                self._writer.finish()
+            self._stream.close()
+            if error is None:
+                os.replace(self._partial, self._path)
+        except OSError as failure:
+            raise self._failure(failure) from failure
+        finally:
+            self._stream.close()
+            with suppress(OSError):
+                self._partial.unlink()
+        if isinstance(error, OSError):
+            raise self._failure(error) from error
+
+    def _failure(self, error: OSError) -> OutputError:
+        return OutputError(f"{self._path}: cannot be written: {error.strerror}")

@@ -1,0 +1,55 @@
+"""A recording as a file of Foxglove's schemas."""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from fieldpose.bus.foreign import ForeignWriter
+from fieldpose.bus.replay import read_recording
+from fieldpose.bus.topics import Address
+from fieldpose.deploy.foxglove.channels import ALL
+from fieldpose.deploy.foxglove.converter import Converted, Converter
+from fieldpose.deploy.reporting.trajectories import in_words
+from fieldpose.stages.nerf.metadata import FieldMetadata
+
+_RECORD = "fieldpose"
+_LATEST_NS = 5_000_000_000
+
+
+def export(recording: Path, out: Path, address: Address, field: FieldMetadata | None) -> dict[str, int]:
+    """Write one pipeline of a recording; returns topic -> number of messages, of all topics.
+
+    Messages have their frame's capture time as log time, and the time of their being sent as publish time. True poses
+    are written where the field is known. Raises RecordingError and OutputError.
+    """
+    converter = Converter(object_from_dataset=None if field is None else field.frame.object_from_dataset)
+    counts: Counter[str] = Counter({channel.topic: 0 for channel in ALL})
+    with ForeignWriter(out) as writer:
+        for channel in ALL:
+            writer.channel(channel.topic, channel.encoding, channel.schema)
+        found = (one for one in read_recording(recording) if address.covers(one.key))
+        for message in in_order(each for one in found for each in converter.convert(one.topic, one.message)):
+            topic = message.channel.topic
+            writer.write(topic, message.payload, message.log_ns, message.publish_ns, message.sequence)
+            counts[topic] += 1
+        about = {"recording": recording.name, "object": address.object, "camera": address.camera}
+        writer.add(_RECORD, {**about, "lengths": in_words(field)})
+    return dict(counts)
+
+
+def in_order(messages: Iterable[Converted]) -> Iterator[Converted]:
+    """Messages by their log times, as readers of long files like them.
+
+    What is told of a frame comes after newer frames; where that is more than _LATEST_NS, the order stays wrong.
+    """
+    waiting: list[tuple[int, int, Converted]] = []
+    newest = 0
+    for number, message in enumerate(messages):
+        heapq.heappush(waiting, (message.log_ns, number, message))
+        newest = max(newest, message.log_ns)
+        while waiting[0][0] < newest - _LATEST_NS:
+            yield heapq.heappop(waiting)[-1]
+    yield from (message for _, _, message in sorted(waiting))

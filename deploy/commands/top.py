@@ -115,9 +115,9 @@ def _heading(address: Address, heading: Heading | None, named: bool) -> Text:
     text.append(str(state.state), _STATE_COLOURS[state.state])
     latency = "-" if heading.latency_ms is None else "{:.0f}, {:.0f}".format(*heading.latency_ms)
     words = [f"score {state.score:.2f}", f"{heading.rate_hz:.1f} frames/s", f"latency p50, p90: {latency} ms"]
-    words.append(f"{state.dropped_at_the_door} dropped at the door, {state.lost} lost, {state.in_flight} in flight")
+    words.append(f"{state.dropped_at_the_door} dropped, {state.lost} lost, {state.in_flight} in flight")
     if state.level:
-        words.append(f"adaptation level {state.level}")
+        words.append(f"level {state.level}")
     return text.append(f", {', '.join(words)}")
 
 

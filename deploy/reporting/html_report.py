@@ -81,7 +81,9 @@ def html(report: Report) -> bytes:
         _section("How true the stated covariances are", _covariances(report.frames)),
         _section("The field", "".join(f"<p>{escape(line.strip())}</p>" for line in report.field_lines)),
         _section("What was decided", _table(report.decided.items())),
-        _section("Settings that are not the defaults", _table(report.settings.items()) or _soft("none")),
+        _section(
+            "Settings that are not the defaults, once all is decided", _table(report.settings.items()) or _soft("none")
+        ),
         _section("Made with", _table(report.made_with.items())),
     ]
     return f"""<!DOCTYPE html>

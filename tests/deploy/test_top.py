@@ -147,7 +147,7 @@ def test_the_table_has_a_line_of_each_process_and_silent_ones_are_red() -> None:
         console.print(shown(standing.rows(2 * SECOND_NS), standing.headings(9 * SECOND_NS)))
     plain = re.sub(r"\x1b\[[\d;]*m", "", captured.get())
     assert plain.startswith("tracking, score 0.90, 0.3 frames/s, latency p50, p90: - ms")
-    assert "7 dropped at the door, 2 lost, 1 in flight" in plain.splitlines()[0]
+    assert "7 dropped, 2 lost, 1 in flight" in plain.splitlines()[0]
     (line,) = (line for line in plain.splitlines() if line.startswith("│ pnp"))
     assert [cell.strip() for cell in line.strip("│").split("│")] == [
         "pnp", "", "40.0", "10.2", "20.5", "50", "301", "2", "3", "1", "4", "0",

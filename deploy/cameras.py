@@ -69,7 +69,9 @@ def in_words(fit: CameraFit, unit: str) -> str:
             " photographs with more overlap, more texture or more pixels would tell"
         )
     if fit.verdict == "fit":
-        return f"cameras fit their images: {fit.before_px:.2f} px {images}; adjusted ones would to {fit.after_px:.2f}"
+        return (
+            f"cameras fit their images: {fit.before_px:.2f} px {images}; adjusted, they would to {fit.after_px:.2f} px"
+        )
     if fit.rotation_deg is None or fit.translation is None:
         return (
             f"cameras do not fit their images: {fit.before_px:.1f} px {images}, and none were found that do; are poses,"

@@ -91,9 +91,11 @@ def capture(
     shots = read_shots(source, most, size, seconds, report)
     if len(shots.chosen) < FEWEST:
         blurred = f"; {len(shots.blurred)} were left out as blurred, so move slowly" if shots.blurred else ""
+        film = "film longer, moving around the object, in a good light; frames without motion or texture are left out"
+        more = f"{film}{blurred}" if shots.follow else "take more photographs, from all around the object"
         raise DatasetError(
-            f"{source}: {len(shots.chosen)} usable images, but at least {FEWEST} are needed; film longer, moving around"
-            f" the object{blurred}"
+            f"{source}: of {shots.seen} images {len(shots.chosen)} can be used, but at least {FEWEST} are needed;"
+            f" {more}"
         )
     threads = threads or usable_cores()
     structure = Structure(shots, threads, report)

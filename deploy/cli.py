@@ -26,6 +26,7 @@ COMMANDS = {
     "train": "posed images -> a field (.safetensors)",
     "estimate": "one image, in one process, without a bus",
     "run": "the pipeline: a source of images through every stage, each a process",
+    "top": "what the processes of a running pipeline do, as a table that lives",
     "view": "a page that shows a running pipeline, or a recording",
     "stage": "one process of the pipeline, for another host or a debugger",
     "record": "record a pipeline that is running",

@@ -9,12 +9,14 @@ from fieldpose.errors import ConfigError, UsageError
 from fieldpose.stages.geometry import Similarity, nearest_point_to_axes
 from fieldpose.stages.geometry.arrays import Vector
 from fieldpose.stages.nerf.datasets.bounds import too_coarse
-from fieldpose.stages.nerf.framing import METRE, OWN_UNIT, in_dataset_frame, reframed, shown_at
+from fieldpose.stages.nerf.framing import METRE, OWN_UNIT, in_dataset_frame, reframed, shown_at, texture_at
 from fieldpose.stages.nerf.metadata import FieldMetadata
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 from fieldpose.stages.nerf.surface.samples import sampled_surface
 
 _SANE = 1e-9, 1e9
+_PLAIN = 7.0
+"""Grey values by which pixels differ: on a can 12 to 36, on the plain floor around it, learnt up to 0.8 too low, 2 to 6."""
 PLANE = "plane"
 """In place of a direction or a point: that of what the object stands on."""
 
@@ -25,6 +27,7 @@ class Framing:
     def __init__(self, renderer: RayRenderer, metadata: FieldMetadata) -> None:
         self._renderer, self.metadata = renderer, metadata
         self._given = metadata
+        self.notes: list[str] = []
         self._change = Similarity.identity()
         self._plane: tuple[Vector, float] | None = None
 
@@ -37,7 +40,10 @@ class Framing:
         if not colon:
             return np.array(numbers(spot, 3, "a point X,Y,Z, or IMAGE:X,Y"))
         x, y = numbers(pixel, 2, "a pixel X,Y after the image's name")
-        return shown_at(self._renderer, self._given, name, x, y)
+        point = shown_at(self._renderer, self._given, name, x, y)
+        if texture_at(self._renderer, self._given, name, x, y) < _PLAIN:
+            self.notes.append(f"{spot} is on a surface with little texture, of which a field may not know where it is")
+        return point
 
     def turn(self, up: str) -> None:
         """z becomes `up`, "X,Y,Z" or PLANE; x stays as near to where it was as it can."""

@@ -129,6 +129,25 @@ def to_json(settings: Settings) -> bytes:
     return json.dumps(msgspec.to_builtins(settings, enc_hook=str), indent=2).encode() + b"\n"
 
 
+def differing(settings: Settings) -> dict[str, str]:
+    """Which settings are not the defaults, by their names on the command line, with their values as text."""
+
+    def told(value: Any) -> str:
+        return value if isinstance(value, str) else json.dumps(value)
+
+    defaults, own = (_flat(msgspec.to_builtins(each, enc_hook=str)) for each in (Settings(), settings))
+    # A table that may be None has other names in it than None has.
+    return {name: told(value) for name, value in own.items() if name not in defaults or defaults[name] != value}
+
+
+def _flat(table: dict[str, Any], place: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in table.items():
+        name = f"{place}{key.replace('_', '-')}"
+        flat |= _flat(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return flat
+
+
 def _converted(value: Any, wanted: Any, where: str) -> Any:
     try:
         return msgspec.convert(value, wanted, strict=True, dec_hook=_path)

@@ -77,8 +77,8 @@ class Options:
             return 0
         alone.descriptors = described(own_views(alone, usable_cores()), self.matching, progress_console().print)
         alone.save(self.out)
-        kept = alone.occupied.sum() / max(field.occupied.sum(), 1)
-        print(f"{self.out}: the object alone, {kept:.1%} of the cells that held something")
+        print(f"{self.out}: the object alone, {alone.occupied.sum()} cells of the scene's {field.occupied.sum()}")
+        print("how exactly it is found is not known; `train --only box` learns and tries it")
         return 0
 
     def _found(self, renderer: RayRenderer, metadata: FieldMetadata) -> np.ndarray:

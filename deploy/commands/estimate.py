@@ -15,6 +15,7 @@ import tyro
 from fieldpose.bus.messages import CameraOrigin, TrackingState
 from fieldpose.deploy.commands.run import planned
 from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
+from fieldpose.deploy.reporting.reasons import reason_in_words
 from fieldpose.deploy.settings import Settings
 from fieldpose.errors import UsageError
 from fieldpose.stages.camera.calibration import Calibration, Calibrator
@@ -77,7 +78,10 @@ class Options:
         if calibration.origin in (CameraOrigin.EXIF, CameraOrigin.ASSUMED):
             print(f"camera: {calibration.told}")
         if found.cam_from_object is None:
-            print(f"no pose: {found.reason} after {seconds:.2f} s")
+            why = "" if found.reason is None else f": {reason_in_words(found.reason)} ({found.reason})"
+            print(
+                f"no pose after {seconds:.2f} s{why}; does it show what the field was learnt of, by the right camera?"
+            )
             return 1
         print(f"cam_from_object (OpenCV axes, {parts.field.metadata.unit}):\n{np.round(found.cam_from_object, 6)}")
         quality = f"{found.inliers} of {found.correspondences} points agree, {found.residual_px:.2f} px"

@@ -11,7 +11,7 @@ import tyro
 
 from fieldpose.deploy.framing import Framing
 from fieldpose.deploy.reporting.fields import frame_in_words
-from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
+from fieldpose.deploy.reporting.output import check_writable, progress_console, write_bytes, write_json
 from fieldpose.errors import OutputError, UsageError
 from fieldpose.stages.cores import usable_cores
 
@@ -65,11 +65,15 @@ class Options:
             from fieldpose.deploy.reporting.picking import page
 
             write_bytes(self.page, page(renderer, field.metadata, self.field))
-            print(f"{self.page}: open it in a browser, and click")
+            print(
+                f"{self.page}: open it in a browser, and click the ends of a known length, the origin or what is level"
+            )
             return 0
         framing = Framing(renderer, field.metadata)
         measured = self._applied(framing)
         framing.check()
+        for note in framing.notes:
+            progress_console().print(f"note: {note}", markup=False, soft_wrap=True)
         field.metadata = framing.metadata
         try:
             field.save(out)
@@ -79,7 +83,7 @@ class Options:
         told = {"unit": field.metadata.unit, "metres_per_unit": field.metadata.metres_per_unit, "measured": measured}
         write_json(self.json, {"object_from_dataset": frame, **told})
         if measured is not None and self.known_distance is not None:
-            print(f"{measured:.4g} between the two points before are {self.known_distance[2]:g} m now")
+            print(f"the two points were {measured:.4g} apart, and are {self.known_distance[2]:g} m apart now")
         print(f"{out}: {frame_in_words(field.metadata)}")
         return 0
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Literal
 
 import tyro
@@ -63,6 +66,9 @@ class Options:
     as 00012.jpg; several pipelines each into its own."""
     plot: Path | None = None
     """Draw errors, scores, latencies and states over time into this file (.png, .svg or .pdf)."""
+    report: Path | None = None
+    """Write a page that tells of the run, with the frames that went worst as pictures, into this folder: report.html,
+    or report-OBJECT-CAMERA.html for each of several pipelines; the run is recorded for it."""
     guess: str | None = None
     """Where to begin: perturb:10-40deg,0.2 (each frame's true pose, disturbed), train:NAME, or a JSON file; without
     it, training views that look like the frame (short for --tracking.guess)."""
@@ -107,14 +113,25 @@ class Options:
             for plan, title in zip(plans, titles, strict=True):
                 print_plan(plan, title)
             return 0
-        check_writable(self.record, self.json, self.csv)
+        check_writable(self.record, self.json, self.csv, self._page)
         check_picture(self.plot)
         files = [self._pose_files(plan, len(plans) > 1) for plan in plans]
         for file in files:
             file.check()
         named = titles[0] if len(plans) == 1 else f"{len(plans)} pipelines"
-        with page_beside(plans, self.listen, self.view) as hub, live_line(named) as report:
-            outcomes = run_pipelines(Run(plans, self.record, hub, self.logs), report)
+        with _recording_for(self.report, self.record) as recording:
+            with page_beside(plans, self.listen, self.view) as hub, live_line(named) as report:
+                outcomes = run_pipelines(Run(plans, recording, hub, self.logs), report)
+            self._write(plans, titles, outcomes)
+            for plan, outcome, file in zip(plans, outcomes, files, strict=True):
+                for line in file.write(Trajectory(plan.settings.address, _unit(plan), outcome.frames)):
+                    print(line)
+            if recording is not None:
+                self._write_pages(plans, titles, outcomes, recording)
+        return INTERRUPTED if any(outcome.interrupted for outcome in outcomes) else 0
+
+    def _write(self, plans: Sequence[Plan], titles: Sequence[str], outcomes: Sequence[RunResult]) -> None:
+        """Print the figures, and write them."""
         figures = {}
         for plan, title, outcome in zip(plans, titles, outcomes, strict=True):
             pair = plan.settings.address.pair
@@ -126,10 +143,22 @@ class Options:
         if self.csv is not None:
             rows = zip((plan.settings.address for plan in plans), (outcome.frames for outcome in outcomes), strict=True)
             write_bytes(self.csv, to_csv(rows))
-        for plan, outcome, file in zip(plans, outcomes, files, strict=True):
-            for line in file.write(Trajectory(plan.settings.address, _unit(plan), outcome.frames)):
-                print(line)
-        return INTERRUPTED if any(outcome.interrupted for outcome in outcomes) else 0
+
+    def _write_pages(
+        self, plans: Sequence[Plan], titles: Sequence[str], outcomes: Sequence[RunResult], recording: Path
+    ) -> None:
+        if self._page is None:
+            return
+        from fieldpose.deploy.reporting.run_report import run_report
+
+        for plan, title, outcome in zip(plans, titles, outcomes, strict=True):
+            path = _of_pipeline(self._page, plan.settings.address.pair, len(plans) > 1)
+            write_bytes(path, run_report(outcome, plan, title, recording))
+            print(f"{path}: a page that tells of the run")
+
+    @property
+    def _page(self) -> Path | None:
+        return None if self.report is None else self.report / "report.html"
 
     def _pose_files(self, plan: Plan, several: bool) -> PoseFiles:
         pair = plan.settings.address.pair
@@ -150,6 +179,19 @@ class Options:
             matching=overridden(s.matching, matcher=self.matcher),
             refinement=overridden(s.refinement, when=self.refine),
         )
+
+
+@contextmanager
+def _recording_for(folder: Path | None, record: Path | None) -> Iterator[Path | None]:
+    """The recording that a report's pictures are taken from: the one asked for, or one in `folder` that is removed.
+
+    None where neither is wanted.
+    """
+    if folder is None or record is not None:
+        yield record
+        return
+    with TemporaryDirectory(prefix=".recording-", dir=folder) as temporary:
+        yield Path(temporary) / "run.mcap"
 
 
 def _title(plan: Plan, several: bool) -> str:

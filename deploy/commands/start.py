@@ -7,6 +7,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +18,7 @@ from rich.table import Table
 
 from fieldpose.deploy.commands import capture, run, train
 from fieldpose.deploy.reporting.output import check_writable, result_console, write_json
-from fieldpose.errors import OutputError, UsageError
+from fieldpose.errors import FieldposeError, OutputError, UsageError
 from fieldpose.stages.nerf.datasets.transforms import FILE
 
 DATASET, FIELD, KEPT = "dataset", "field.safetensors", "start.json"
@@ -33,6 +34,9 @@ class _Kept:
 
     def has(self, step: str, made_of: dict[str, Any]) -> bool:
         return self.made_of.get(step) == msgspec.to_builtins(made_of)
+
+    def of(self, step: str) -> dict[str, Any]:
+        return self.made_of.get(step, {})
 
     def note(self, step: str, made_of: dict[str, Any]) -> None:
         self.made_of[step] = msgspec.to_builtins(made_of)
@@ -55,8 +59,9 @@ class Options:
 
     Does what `capture`, `train` and `run` do, one after the other, with what each of them says; look there for more to
     set. Everything goes into one folder: dataset/, field.safetensors with its picture (.jpg, from the first fifth of
-    the training on) and its turntable (.mp4), and of the run poses.csv, run.json and timeline.png. Given again, the
-    command goes on where it was ended, and does not do again what is there. The JSON file has: steps (step, result,
+    the training on) and its turntable (.mp4), and of each run a folder run-NAME with poses.csv, run.json and
+    timeline.png. Given again, the command goes on where it was ended, and does not do again what is there. The JSON
+    file has: steps (step, result,
     seconds: null where it was there already, peak_mb: the most memory of this process and its children so far).
     """
 
@@ -67,8 +72,8 @@ class Options:
     field is made."""
     out: Path | None = None
     """The folder to write; by default out/ and the name of the source."""
-    minutes: float = 5.0
-    """How long to learn."""
+    minutes: float | None = None
+    """How long to learn, 5 by default; what it takes to look before and to try the field after comes on top."""
     only: Literal["box", "masks"] | None = None
     """Learn the object alone, so that it is found wherever it is moved: what is in the box that `capture` puts around
     it, or what masks show."""
@@ -81,8 +86,10 @@ class Options:
 
     def run(self) -> int:
         """Do the steps that are left, say what each took."""
-        if not 0 < self.minutes < float("inf"):
+        if self.minutes is not None and not 0 < self.minutes < float("inf"):
             raise UsageError(f"--minutes {self.minutes:g}: must be more than 0")
+        if ":" not in self.source and not Path(self.source).exists():
+            raise UsageError(f"{self.source}: no such file; expected a video, a folder of photographs, or camera:0")
         on = None if self.on is None else _source(self.on)
         folder = self._folder()
         kept, rows = self._kept(folder), list[_Row]()
@@ -91,14 +98,16 @@ class Options:
         write_json(self.json, {"steps": rows})
         _print(rows)
         if not code and self.on is None:
-            print(f"next: the same command with --on camera:0 or --on VIDEO, or `fieldpose run {folder / FIELD}`")
+            print(f"next: the same command with --on camera:0 or --on VIDEO; `fieldpose info {folder / FIELD}`")
         return code
 
     def _folder(self) -> Path:
         if self.out is not None:
             return self.out
-        name = Path(self.source.partition(":")[2] or self.source).resolve().stem
-        return Path("out") / (name if not name.isdecimal() else f"camera{name}")
+        folder = Path("out") / _name_of(self.source)
+        if folder.resolve() == Path(self.source).resolve():
+            raise UsageError(f"{folder}: is the source, and would be where everything goes; give --out")
+        return folder
 
     def _kept(self, folder: Path) -> _Kept:
         path = folder / KEPT
@@ -124,16 +133,31 @@ class Options:
         shutil.rmtree(dataset, ignore_errors=True)
         kept.note("capture", made_of)
         options = capture.Options(self.source, dataset, marker=self.marker, family=self.family)
-        return _timed("capture", str(dataset), options.capture, rows)
+        try:
+            return _timed("capture", str(dataset), options.capture, rows)
+        except FieldposeError:
+            shutil.rmtree(dataset, ignore_errors=True)
+            kept.path.unlink(missing_ok=True)
+            with suppress(OSError):
+                folder.rmdir()
+            raise
 
     def _train(self, folder: Path, kept: _Kept, rows: list[_Row]) -> int:
         path = folder / FIELD
         made_of = {"dataset": (folder / DATASET / FILE).read_text(), "minutes": self.minutes, "only": self.only}
-        if path.is_file() and kept.has("train", made_of):
-            rows.append(_row("train", str(path), None))
+        if path.is_file():
+            # A field that somebody has may have a frame of its own by now: never learnt anew without being asked.
+            if self.minutes is None and kept.has("train", made_of | {"minutes": kept.of("train").get("minutes")}):
+                made_of["minutes"] = kept.of("train").get("minutes")
+            if not kept.has("train", made_of):
+                raise OutputError(
+                    f"{path}: was learnt for another time, of another dataset or of another part of it; name another"
+                    " --out, or remove it to learn anew"
+                )
+            rows.append(_row("train", _with_picture(path), None))
             return 0
         options = train.Options(folder / DATASET, path, minutes=self.minutes, only=self.only)
-        code = _timed("train", str(path), options.run, rows)
+        code = _timed("train", _with_picture(path), options.run, rows)
         if not code:
             kept.note("train", made_of)
         return code
@@ -141,11 +165,22 @@ class Options:
     def _run(self, folder: Path, on: str | None, rows: list[_Row]) -> int:
         if on is None:
             return 0
-        written = folder / "poses.csv"
+        into = folder / f"run-{_name_of(on)}"
+        written = into / "poses.csv"
         options = run.Options(
-            (str(folder / FIELD),), (on,), json=folder / "run.json", csv=written, plot=folder / "timeline.png"
+            (str(folder / FIELD),), (on,), json=into / "run.json", csv=written, plot=into / "timeline.png"
         )
-        return _timed("run", f"{on}: {written}", options.run, rows)
+        return _timed("run", f"{written}, timeline.png", options.run, rows)
+
+
+def _with_picture(field: Path) -> str:
+    return f"{field}, {field.with_suffix('.jpg').name}, {field.with_suffix('.mp4').name}"
+
+
+def _name_of(source: str) -> str:
+    path = Path(source)
+    name = path.resolve().stem if path.exists() else Path(source.partition(":")[2] or source).stem
+    return f"camera{name}" if name.isdecimal() else name
 
 
 def _source(on: str) -> str:

@@ -90,7 +90,7 @@ def in_words(accuracy: PoseAccuracy | TooFew) -> str:
         return f"{told}: are the dataset's poses, their axes and its camera right?"
     told = (
         f"the pose of a training image is found to {accuracy.rotation_deg:.2g} degrees and"
-        f" {accuracy.translation:.2g} in the median, {accuracy.found} of {accuracy.images}"
+        f" {accuracy.translation:.2g} units in the median, {accuracy.found} of {accuracy.images}"
     )
     doubtful = accuracy.found < _MOST * accuracy.images or accuracy.error_scale > _LARGE
     return f"{told}; few or inexact: are the dataset's poses and its camera right?" if doubtful else told

@@ -39,7 +39,7 @@ def frame_in_words(metadata: FieldMetadata) -> str:
     metres = metadata.metres_per_unit
     unit = "lengths in metres" if metres == 1 else f"lengths in: {metadata.unit}"
     if metres is None:
-        unit += ", how long in metres is not known"
+        unit += "; how many metres that is, is not known"
     elif metres != 1:
         unit += f", of {metres:g} m"
     if metadata.frame == Frame():

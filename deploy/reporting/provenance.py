@@ -27,7 +27,7 @@ def metadata(plans: Sequence[Plan]) -> Metadata:
     """Names, seeds and versions, as text, and what was decided for the run; of each of several pipelines its own."""
     records: dict[str, Mapping[str, str]] = {}
     for plan in plans:
-        records |= {_record(RUN_RECORD, plan, plans): _made_with(plan), _record(PLAN_RECORD, plan, plans): plan.notes}
+        records |= {_record(RUN_RECORD, plan, plans): made_with(plan), _record(PLAN_RECORD, plan, plans): plan.notes}
     return records
 
 
@@ -80,7 +80,8 @@ def recorded_field(path: Path, recording: RecordingInfo, folder: Path, pipeline:
     return copy
 
 
-def _made_with(plan: Plan) -> dict[str, str]:
+def made_with(plan: Plan) -> dict[str, str]:
+    """Names, seed and versions of a run, as text."""
     settings, field = plan.settings, plan.field
     values = {
         "source": settings.camera.source,

@@ -13,6 +13,8 @@ from fieldpose.deploy.processes.pipeline import Progress, Standing
 from fieldpose.deploy.reporting.output import progress_console, result_console
 
 _MISSING = "-"
+STAGES_TITLE = "latency by stage, waiting included (ms)"
+STAGE_COLUMNS = ("stage", "p50", "p90", "its own work, p50", "cpu s", "memory MB")
 CAMERA_ORIGINS = {
     "calibrated": "from a calibration", "training": "of the training views", "exif": "from EXIF",
     "assumed": "with an ASSUMED field of view, so that no pose is sure; give --camera.camera-file",
@@ -79,12 +81,13 @@ def _figures(summary: Mapping[str, Any], title: str) -> Table:
     table = Table(title=title, show_header=False, title_justify="left")
     table.add_column("what")
     table.add_column("value", justify="right")
-    for what, value in _rows(summary):
+    for what, value in rows(summary):
         table.add_row(what, value)
     return table
 
 
-def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    """The figures of a run's summary in words: what, and its value."""
     sent, dropped = summary["frames_sent"], summary["dropped_at_the_door"]
     yield "frames sent / dropped at the door", f"{sent} / {dropped}"
     yield "frames / with a pose / lost", f"{summary['frames']} / {summary['poses_ok']} / {summary['frames_lost']}"
@@ -121,14 +124,20 @@ def _rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _stages(summary: Mapping[str, Any]) -> Table:
-    table = Table(title="latency by stage, waiting included (ms)", title_justify="left")
-    for heading in ("stage", "p50", "p90", "its own work, p50", "cpu s", "memory MB"):
+    table = Table(title=STAGES_TITLE, title_justify="left")
+    for heading in STAGE_COLUMNS:
         table.add_column(heading, justify="left" if heading == "stage" else "right")
+    for row in stage_rows(summary):
+        table.add_row(*row)
+    return table
+
+
+def stage_rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Of each stage what STAGE_COLUMNS names."""
     for name, latency in summary["latency_ms"]["by_stage"].items():
         process = summary["processes"].get(name, {})
         numbers = (*latency.values(), process.get("busy_ms_p50"), process.get("cpu_s"), process.get("rss_mb"))
-        table.add_row(name, *(_number(value) for value in numbers))
-    return table
+        yield name, *(_number(value) for value in numbers)
 
 
 def _number(value: float | None) -> str:

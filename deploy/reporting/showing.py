@@ -45,17 +45,24 @@ def pictures(
 
     Raises RecordingError, and OutputError for a frame that cannot be decoded.
     """
-    finished = {result.frame_id: result for result in results if result.outcome == "finished"}
-    done = 0
+    finished = [result for result in results if result.outcome == "finished"]
+    for done, picture in enumerate(pictures_of(recording, finished, renderer, address), 1):
+        yield picture
+        report(done, len(finished))
+
+
+def pictures_of(
+    recording: Path, results: Sequence[FrameResult], renderer: RayRenderer, address: Address | None = None
+) -> Iterator[Picture]:
+    """As `pictures`, of all these frames, whatever became of them."""
+    wanted = {result.frame_id: result for result in results}
     for recorded in read_recording(recording, (FRAME,)):
         if address is not None and not address.covers(recorded.key):
             continue
         frame = cast(Frame, recorded.message)
-        result = finished.pop(frame.header.frame_id, None)
+        result = wanted.pop(frame.header.frame_id, None)
         if result is not None:
             yield _picture(frame, result, renderer)
-            done += 1
-            report(done, len(finished) + done)
 
 
 def write_video(path: Path, shown: Iterator[Picture]) -> Picture | None:

@@ -46,10 +46,15 @@ class _Panel:
 
 
 def plot_timeline(frames: Sequence[FrameResult], path: Path, title: str, live: bool = True) -> None:
-    """Write a .png, .svg or .pdf; frames are oldest first. Panels of which nothing is known are left out.
+    """Write a .png, .svg or .pdf of what `timeline` draws. Raises OutputError."""
+    write_bytes(path, timeline(frames, path.suffix.removeprefix("."), title, live))
+
+
+def timeline(frames: Sequence[FrameResult], kind: str, title: str, live: bool = True) -> bytes:
+    """A png, svg or pdf; frames are oldest first. Panels of which nothing is known are left out.
 
     live: frames were sent as they were captured, so that latencies can be from their capture; else they are from
-    their sending. Raises OutputError.
+    their sending.
     """
     start_ns = frames[0].capture_ns if frames else 0
     timed = [((frame.capture_ns - start_ns) / 1e9, frame) for frame in frames]
@@ -65,7 +70,7 @@ def plot_timeline(frames: Sequence[FrameResult], path: Path, title: str, live: b
     drawing.align_ylabels()
     _draw_legend(drawing)
     drawing.suptitle(f"{title}\n{_in_words(frames, live)}", fontsize=10)
-    _save(drawing, path)
+    return file_of(drawing, kind)
 
 
 def _panels(live: bool) -> list[_Panel]:
@@ -173,7 +178,8 @@ def _in_words(frames: Sequence[FrameResult], live: bool) -> str:
     return "; ".join(words)
 
 
-def _save(drawing: Figure, path: Path) -> None:
+def file_of(drawing: Figure, kind: str) -> bytes:
+    """The content of a png, svg or pdf."""
     content = io.BytesIO()
-    drawing.savefig(content, dpi=_DPI, format=path.suffix.removeprefix("."))
-    write_bytes(path, content.getvalue())
+    drawing.savefig(content, dpi=_DPI, format=kind)
+    return content.getvalue()

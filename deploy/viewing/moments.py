@@ -15,11 +15,11 @@ from fieldpose.bus.messages import (
     Frame,
     Header,
     Message,
-    Reason,
     State,
     TrackingState,
 )
 from fieldpose.bus.topics import CAMERA_INFO, CORRESPONDENCES, FOLLOWED, FRAME, STATE
+from fieldpose.deploy.reporting.reasons import reason_in_words
 from fieldpose.stages.geometry import Camera, camera_centre
 
 WATCHED = (FRAME, CAMERA_INFO, STATE, FOLLOWED, CORRESPONDENCES)
@@ -27,19 +27,6 @@ _KEPT, _IMAGES = 256, 8
 _WAY = 5000
 _FEW = 0.5
 """Of the points that were looked for."""
-WHY = {
-    Reason.FRAME_UNREADABLE: "the image cannot be decoded",
-    Reason.NOTHING_ALIKE: "no training view looks like the frame",
-    Reason.NOTHING_IN_VIEW: "the field is not in view from where the camera was looked for",
-    Reason.TOO_FEW_MATCHES: "field and frame show too little that is alike",
-    Reason.TOO_FEW_CONSISTENT_POINTS: "too few of the matches are on a surface",
-    Reason.NO_CONSENSUS: "what was matched does not agree on a pose",
-    Reason.IMPLAUSIBLE_POSE: "the pose that was found is not near what was shown",
-    Reason.CAMERA_DIFFERS: "the focal length is not as it is said to be",
-    Reason.NO_ANSWER: "no stage has answered in time",
-    Reason.RESET: "tracking was reset",
-}
-"""In words; the others say it themselves."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +130,7 @@ def told(moment: Moment) -> str:
         if found < _FEW * looked_for:
             words[-1] += ": occluded, blurred, or out of view"
     if state.reason is not None:
-        words.append(WHY.get(state.reason, str(state.reason).replace("_", " ")))
+        words.append(reason_in_words(state.reason))
     if state.level:
         words.append("following does less than it might, for want of time")
     return "; ".join(words)

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from fieldpose.errors import ConfigError
-from fieldpose.stages.geometry import Similarity, rays
+from fieldpose.stages.geometry import Similarity, camera_centres, rays
 from fieldpose.stages.nerf.datasets import find_name
 from fieldpose.stages.nerf.metadata import CameraFit, FieldMetadata, Frame, PoseAccuracy, TrainingCamera
 from fieldpose.stages.nerf.rendering_api import RayRenderer
@@ -15,6 +15,10 @@ METRE = "metre"
 OWN_UNIT = "unit that was chosen for the field"
 SOLID = 0.5
 """Opacity of a ray that meets a surface."""
+_AROUND_PX = 4
+_ASKED, _FEWEST_AGREED = 40, 2
+_AGREE = 0.03
+"""Of the distance, by which views may see a surface elsewhere: a can's is seen to 0.01, a plain floor's anywhere."""
 
 
 def reframed(metadata: FieldMetadata, new_from_old: Similarity) -> FieldMetadata:
@@ -68,7 +72,49 @@ def shown_at(renderer: RayRenderer, metadata: FieldMetadata, name: str, x: float
     if traced.opacity[0] < SOLID:
         raise ConfigError(f"{view.name} shows nothing solid at pixel {x:g},{y:g}; name another one")
     point: np.ndarray = origins[0] + float(traced.depth[0]) * directions[0]
+    agreed, doubted = _seen_by_others(renderer, metadata, point)
+    if agreed < max(_FEWEST_AGREED, doubted):
+        raise ConfigError(
+            f"how far it is to what {view.name} shows at pixel {x:g},{y:g} is not known: {agreed} other views see a"
+            f" surface there, {doubted} see past it; choose a place with texture"
+        )
     return point
+
+
+def texture_at(renderer: RayRenderer, metadata: FieldMetadata, name: str, x: float, y: float) -> float:
+    """How much grey values (0 to 255) differ around a pixel of a training view, as a standard deviation.
+
+    Of surfaces that look the same all over, no two images tell where they are.
+    """
+    names = [camera.name for camera in metadata.cameras]
+    view = metadata.cameras[names.index(find_name(names, name))]
+    around = np.arange(-_AROUND_PX, _AROUND_PX + 1)
+    pixels = np.stack(np.meshgrid(x + around, y + around), axis=-1).reshape(-1, 2)
+    origins, directions = rays(view.camera, view.pose, pixels)
+    seen = renderer.render_rays(origins.astype(np.float32), directions.astype(np.float32))
+    return float(255 * seen.rgb.mean(axis=1).std())
+
+
+def _seen_by_others(renderer: RayRenderer, metadata: FieldMetadata, point: np.ndarray) -> tuple[int, int]:
+    """How many training views see a surface at a point (3,), and how many see something behind it."""
+    cameras = metadata.cameras[:: -(-len(metadata.cameras) // _ASKED)]
+    centres = camera_centres(np.stack([camera.pose for camera in cameras]))
+    within = np.array([_in_image(camera, point) for camera in cameras])
+    if not within.any():
+        return 0, 0
+    traced = renderer.render_rays(centres[within].astype(np.float32), (point - centres[within]).astype(np.float32))
+    solid = traced.opacity >= SOLID
+    there = solid & (np.abs(traced.depth - 1) <= _AGREE)
+    past = (traced.depth > 1 + _AGREE) | ~solid
+    return int(there.sum()), int(past.sum())
+
+
+def _in_image(view: TrainingCamera, point: np.ndarray) -> bool:
+    in_cam = view.pose[:3, :3] @ point + view.pose[:3, 3]
+    if in_cam[2] <= 0:
+        return False
+    x, y = view.camera.project(in_cam[None])[0]
+    return bool(0 <= x < view.width and 0 <= y < view.height)
 
 
 def _changed(metadata: FieldMetadata, new_from_old: Similarity) -> Frame:

@@ -251,7 +251,7 @@ def _what(dataset: Dataset, box: np.ndarray | None) -> str:
     if dataset.scene == "object":
         shown = "what the images do not leave transparent" if dataset.has_alpha else "what is before a plain background"
         return f"learning an object alone: {shown}"
-    return "learning the scene: all that the images show, which is not to move against each other later"
+    return "learning the whole scene, in which the object has to stay where it is (--only box learns it alone)"
 
 
 def finished(learner: Learner, metadata: FieldMetadata, views: Sequence[View]) -> Field:

@@ -66,7 +66,7 @@ def test_what_is_not_found_tells_nothing(scene: AnalyticScene, images: list[np.n
 
 def test_few_that_are_found_are_a_reason_to_doubt() -> None:
     assert in_words(PoseAccuracy(32, 32, 0.0131, 0.00087, 0.9)) == (
-        "the pose of a training image is found to 0.013 degrees and 0.00087 in the median, 32 of 32"
+        "the pose of a training image is found to 0.013 degrees and 0.00087 units in the median, 32 of 32"
     )
     assert "are the dataset's poses" in in_words(PoseAccuracy(32, 20, 0.01, 0.001, 0.9))
 

@@ -142,7 +142,7 @@ def test_few_images_are_refused(pictures: list[np.ndarray], tmp_path: Path) -> N
         Image.fromarray(picture).save(tmp_path / f"{i}.png")
     ran = fieldpose("capture", tmp_path, "--out", tmp_path / "out", cwd=tmp_path)
     assert ran.returncode == 2
-    assert "4 usable images, but at least 8 are needed" in ran.stderr
+    assert "images 4 can be used, but at least 8 are needed" in ran.stderr
     assert not (tmp_path / "out" / "images").exists()
 
 

@@ -114,7 +114,7 @@ def test_training_says_what_it_learns(tmp_path: Path, capsys: pytest.CaptureFixt
     root, out = masked_dataset(tmp_path / "data", 12), tmp_path / "field.safetensors"
     assert train(root, out) == 0
     said = capsys.readouterr().err
-    assert "learning the scene" in said
+    assert "learning the whole scene" in said
     assert "what these leave out is not learnt" in said
     assert load_field(out).metadata.has_background
     assert train(root, out, "--only", "masks") == 0

@@ -66,7 +66,7 @@ def test_a_known_distance_gives_metres(field: Path, tmp_path: Path, capsys: pyte
     apart = float(np.linalg.norm(eyes[0] - eyes[1]) / np.linalg.norm(eyes[0]) * BALL_RADIUS)
     spots = ["0:31.5,31.5", "6:31.5,31.5"]
     assert main(["frame", str(field), "--known-distance", *spots, "0.5", "--json", str(told)]) == 0
-    assert "are 0.5 m now" in capsys.readouterr().out
+    assert "are 0.5 m apart now" in capsys.readouterr().out
     figures, metadata = json.loads(told.read_text()), load_metadata(field)
     assert figures["measured"] == pytest.approx(apart, rel=0.05)
     assert figures["object_from_dataset"]["scale"] == pytest.approx(0.5 / figures["measured"])

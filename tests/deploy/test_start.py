@@ -49,10 +49,10 @@ def test_a_video_becomes_poses_and_what_is_there_is_not_done_again(video: Path, 
         ("capture", True), ("train", True), ("run", False)
     ]  # fmt: skip
     assert (out / "field.safetensors").stat().st_mtime_ns == learnt
-    rows = list(csv.DictReader((out / "poses.csv").read_text().splitlines()))
+    rows = list(csv.DictReader((out / "run-walk" / "poses.csv").read_text().splitlines()))
     assert len(rows) == 20
     assert sum(bool(row["cam_from_object_00"]) for row in rows) > 10
-    assert {"run.json", "timeline.png"} <= {p.name for p in out.iterdir()}
+    assert {"run.json", "timeline.png"} <= {p.name for p in (out / "run-walk").iterdir()}
     other = fieldpose("start", video, "--out", out, "--marker", "0.1", cwd=tmp_path)
     assert other.returncode == 2
     assert "holds what was captured of another source, or with another marker" in other.stderr
@@ -65,21 +65,24 @@ def test_a_capture_that_failed_is_done_again(tmp_path: Path, capsys: pytest.Capt
     cv2.imwrite(str(source / "a.png"), np.zeros((40, 40, 3), np.uint8))
     for _ in range(2):
         assert main(["start", str(source), "--out", str(out)]) == 2
-        assert "usable images" in capsys.readouterr().err
-        (out / "dataset").mkdir(exist_ok=True)
-        (out / "dataset" / "left.jpg").write_bytes(b"")
-    assert not (out / "dataset" / "transforms.json").exists()
+        assert "take more photographs" in capsys.readouterr().err
+        assert not out.exists()
 
 
-def test_a_training_that_fails_leaves_the_field(tmp_path: Path) -> None:
+def test_a_field_is_never_learnt_anew_without_being_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     (out / "dataset").mkdir(parents=True)
     (out / "dataset" / "transforms.json").write_text("{}")
     (out / "field.safetensors").write_bytes(b"learnt for hours")
     (tmp_path / "photos").mkdir()
     made_of = {"source": _identity(str(tmp_path / "photos")), "marker": None, "family": "4x4"}
-    (out / "start.json").write_text(json.dumps({"capture": made_of}))
-    assert main(["start", str(tmp_path / "photos"), "--out", str(out), "--only", "masks"]) == 2
+    learnt = {"dataset": "{}", "minutes": 60.0, "only": None}
+    (out / "start.json").write_text(json.dumps({"capture": made_of, "train": learnt}))
+    given = ["start", str(tmp_path / "photos"), "--out", str(out)]
+    for options in (["--only", "masks"], ["--minutes", "5"]):
+        assert main([*given, *options]) == 2
+        assert "name another --out, or remove it to learn anew" in capsys.readouterr().err
+    assert main(given) == 0
     assert (out / "field.safetensors").read_bytes() == b"learnt for hours"
 
 
@@ -98,11 +101,13 @@ def test_folders_of_others_are_left_alone(tmp_path: Path, capsys: pytest.Capture
     out = tmp_path / "mine"
     out.mkdir()
     (out / "precious.txt").write_text("mine")
-    assert main(["start", "nothing.mp4", "--out", str(out)]) == 2
+    assert main(["start", "camera:7", "--out", str(out)]) == 2
     assert "not made by `fieldpose start`" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == ["precious.txt"]
     assert main(["start", "nothing.mp4", "--out", str(tmp_path / "new"), "--minutes", "0"]) == 2
     assert "must be more than 0" in capsys.readouterr().err
-    assert main(["start", "nothing.mp4", "--out", str(tmp_path / "new"), "--on", "no.mp4"]) == 2
-    assert "no such file" in capsys.readouterr().err
+    assert main(["start", "camera:7", "--out", str(tmp_path / "new"), "--on", "no.mp4"]) == 2
+    assert "--on no.mp4: no such file" in capsys.readouterr().err
+    assert main(["start", "nothing.mp4"]) == 2
+    assert "nothing.mp4: no such file" in capsys.readouterr().err
     assert not (tmp_path / "new" / "dataset").exists()

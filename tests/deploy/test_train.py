@@ -122,6 +122,6 @@ def test_how_well_training_images_are_found_is_told(
     assert main([*arguments, *SMALL]) == 0
     assert load_field(out).metadata.accuracy == told
     assert json.loads(figures.read_text())["accuracy"]["error_scale"] == 1.2
-    assert "found to 0.02 degrees and 0.001 in the median, 31 of 32" in capsys.readouterr().out
+    assert "found to 0.02 degrees and 0.001 units in the median, 31 of 32" in capsys.readouterr().out
     assert main(["doctor", "--field", str(out)]) in (0, 1)
     assert "31 of 32" in capsys.readouterr().out

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import IO, TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
 from rich.table import Table
 
-from fieldpose.deploy.reporting.output import check_writable, result_console, write_json
+from fieldpose.deploy.reporting.output import check_writable, result_console, write_bytes, write_json
 from fieldpose.deploy.settings import Settings
 from fieldpose.errors import UsageError
 
 if TYPE_CHECKING:
     from fieldpose.deploy.evaluation.occlusion import DrawThing
     from fieldpose.deploy.evaluation.pairs import Protocol
+    from fieldpose.deploy.evaluation.running import Examination
     from fieldpose.deploy.evaluation.scores import Answer
     from fieldpose.deploy.evaluation.surface import Surface
     from fieldpose.stages.nerf.datasets import Dataset
@@ -27,6 +29,9 @@ if TYPE_CHECKING:
     from fieldpose.stages.nerf.rendering_api import RayRenderer
 
 _WRITTEN_EVERY_S = 60.0
+_COLUMNS = (
+    "method", "pairs", "< 5 deg", "< 0.05", "ok", "right of ok", "RE mean", "median", "TE mean", "median", "s",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -82,6 +87,9 @@ class Options:
     """Write the scores into this file."""
     plot: Path | None = None
     """Write success curves into this file (.png)."""
+    report: Path | None = None
+    """Write a page with the scores, the curves and the answers that were worst as pictures into this folder:
+    report.html."""
     config: Path | None = None
     """TOML or JSON file of settings; flags win over it."""
     settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
@@ -96,7 +104,8 @@ class Options:
         from fieldpose.stages.nerf.loading import make_renderer, warm_up
         from fieldpose.stages.nerf.training_views import training_views
 
-        check_writable(self.json, self.plot)
+        page = None if self.report is None else self.report / "report.html"
+        check_writable(self.json, self.plot, page)
         self._check()
         field = load_field(self.field)
         # Shifts and scores of the protocols are lengths of the dataset.
@@ -126,8 +135,12 @@ class Options:
                 written = time.monotonic()
         figures = {**about, **_scores(answers, surface)}
         write_json(self.json, figures)
-        self._draw(answers, surface)
+        if self.plot is not None:
+            self._draw(answers, surface, self.plot)
         _print(figures)
+        if page is not None:
+            write_bytes(page, self._page(answers, surface, examination, figures))
+            print(f"{page}: a page of the scores")
         _warn_of_training_images(field, dataset)
         return 0
 
@@ -194,17 +207,32 @@ class Options:
             return None
         return painted if self.occluders is None else objects_of(load_dataset(self.occluders, "test", self.size))
 
-    def _draw(self, answers: Mapping[str, Sequence[Answer]], surface: Surface | None) -> None:
+    def _page(
+        self, answers: Mapping[str, Sequence[Answer]], surface: Surface | None, examination: Examination,
+        figures: dict[str, Any],
+    ) -> bytes:  # fmt: skip
+        from fieldpose.deploy.evaluation.page import Evaluation, html
+        from fieldpose.deploy.settings import differing
+
+        curves = io.BytesIO()
+        self._draw(answers, surface, curves)
+        about = [f"looked for with {self.field.name}", *_about(figures)]
+        scores = (_COLUMNS, list(_rows(figures["methods"])))
+        settings = differing(self.settings)
+        return html(Evaluation(str(self.dataset), about, scores, _gaps(figures), curves.getvalue(), settings),
+                    answers, examination)  # fmt: skip
+
+    def _draw(
+        self, answers: Mapping[str, Sequence[Answer]], surface: Surface | None, path: Path | IO[bytes]
+    ) -> None:  # fmt: skip
         from fieldpose.deploy.evaluation.plots import plot_reach, plot_success
 
-        if self.plot is None:
-            return
         count = max(len(given) for given in answers.values())
         title = f"{self.field.name}, {self.protocol}, {count} pairs"
         if self.protocol == "reach":
-            plot_reach(answers, self.plot, title, None if surface is None else surface.diameter)
+            plot_reach(answers, path, title, None if surface is None else surface.diameter)
         else:
-            plot_success(answers, self.plot, title)
+            plot_success(answers, path, title)
 
 
 def _warn_of_training_images(field: Field, dataset: Dataset) -> None:
@@ -233,7 +261,16 @@ def _scores(answers: Mapping[str, Sequence[Answer]], surface: Surface | None) ->
 
 
 def _print(figures: dict[str, Any]) -> None:
-    console, protocol = result_console(), figures["protocol"]
+    console = result_console()
+    for line in _about(figures):
+        console.print(line, highlight=False)
+    console.print(_table(figures["methods"]))
+    for line in _gaps(figures):
+        console.print(line, highlight=False)
+
+
+def _about(figures: dict[str, Any]) -> list[str]:
+    protocol = figures["protocol"]
     least, most = protocol["angle_deg"]
     lines = [
         f"{figures['pairs']} pairs (seeds {in_short(figures['seeds'])}), lengths in: {figures['unit']}",
@@ -242,13 +279,16 @@ def _print(figures: dict[str, Any]) -> None:
     ]
     if figures["covered"] is not None:
         lines.append(f"{figures['covered']:.0%} of the images are covered")
-    for line in lines:
-        console.print(line, highlight=False)
-    console.print(_table(figures["methods"]))
+    return lines
+
+
+def _gaps(figures: dict[str, Any]) -> list[str]:
+    lines = []
     for name, gap in figures["differences"].items():
         plain = f"RE {_gap(gap['re_deg'])}, TE {_gap(gap['te'])}"
         capped = f"capped: RE {_gap(gap['capped_re_deg'])}, TE {_gap(gap['capped_te'])}"
-        console.print(f"{name} against {gap['than']}: {plain}; {capped}", highlight=False)
+        lines.append(f"{name} against {gap['than']}: {plain}; {capped}")
+    return lines
 
 
 def in_short(numbers: Sequence[int]) -> str:
@@ -261,20 +301,25 @@ def in_short(numbers: Sequence[int]) -> str:
 
 def _table(methods: dict[str, Any]) -> Table:
     table = Table()
-    errors_and_time = ("RE mean", "median", "TE mean", "median", "s")
-    for column in ("method", "pairs", "< 5 deg", "< 0.05", "ok", "right of ok", *errors_and_time):
+    for column in _COLUMNS:
         table.add_column(column, justify="left" if column == "method" else "right")
+    for row in _rows(methods):
+        table.add_row(*row)
+    return table
+
+
+def _rows(methods: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Of each method what _COLUMNS names."""
     for name, row in methods.items():
         shares = ("share_re_below_5deg", "share_te_below_0.05", "share_ok", "share_ok_right")
         errors = (("mean_re_deg", 3), ("median_re_deg", 3), ("mean_te", 5), ("median_te", 5))
-        table.add_row(
+        yield (
             name,
             str(row["pairs"]),
             *(_number(row[share], 3) for share in shares),
             *(_number(row[error], digits) for error, digits in errors),
             f"{row['seconds_per_image']:.2f}",
         )
-    return table
 
 
 def _gap(gap: dict[str, float] | None) -> str:

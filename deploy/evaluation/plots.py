@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -20,7 +20,7 @@ _BINS = 9
 _COLOURS = 10
 
 
-def plot_success(answers: Answers, path: Path, title: str) -> None:
+def plot_success(answers: Answers, path: Path | IO[bytes], title: str) -> None:
     """Share of pairs below each error, and share of true poses inside each ellipsoid, by method."""
     drawing, axes = plt.subplots(1, 3, figsize=(14, 4.6), layout="constrained")
     limits = (np.geomspace(0.01, 180, 200), np.geomspace(1e-4, 10, 200))
@@ -34,7 +34,7 @@ def plot_success(answers: Answers, path: Path, title: str) -> None:
     _save(drawing, path, title)
 
 
-def plot_reach(answers: Answers, path: Path, title: str, diameter: float | None) -> None:
+def plot_reach(answers: Answers, path: Path | IO[bytes], title: str, diameter: float | None) -> None:
     """Share of right poses by how far the guess was turned, and by how far it was shifted.
 
     Shifts are in object diameters, or in field units where the diameter is not known.
@@ -89,8 +89,9 @@ def _framed(axis: Axes, x_label: str, y_label: str) -> None:
     axis.grid(visible=True, alpha=0.3)
 
 
-def _save(drawing: Figure, path: Path, title: str) -> None:
+def _save(drawing: Figure, path: Path | IO[bytes], title: str) -> None:
     drawing.suptitle(title, fontsize=10)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(path, Path):
+        path.parent.mkdir(parents=True, exist_ok=True)
     drawing.savefig(path, dpi=110)
     plt.close(drawing)

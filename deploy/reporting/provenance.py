@@ -92,7 +92,12 @@ def made_with(plan: Plan) -> dict[str, str]:
     }
     if field is not None:
         values |= {"field": str(field), "field_sha256": sha256_of(field)}
-    return values | {f"version {name}": _version(name) for name in _PACKAGES}
+    return values | versions()
+
+
+def versions() -> dict[str, str]:
+    """Of the packages that results depend on, as text."""
+    return {f"version {name}": _version(name) for name in _PACKAGES}
 
 
 def _folder(plan: Plan, plans: Sequence[Plan]) -> str:

@@ -20,6 +20,9 @@ from support.commands import command, fieldpose
 from support.pictures import needs
 
 from fieldpose.deploy.cli import main
+from fieldpose.deploy.evaluation.page import worst as worst_answers
+from fieldpose.deploy.evaluation.pairs import Pair
+from fieldpose.deploy.evaluation.scores import Answer
 from fieldpose.deploy.reporting.html_report import Report, html
 from fieldpose.deploy.reporting.results import FrameResult, RunResult, TruthKnown, summarise
 from fieldpose.deploy.reporting.worst import Bad, worst
@@ -183,6 +186,36 @@ def test_a_folder_that_cannot_be_written_is_told_before_the_run(
     field, source = demo_file("field.safetensors"), f"mcap:{demo_file('sequence.mcap')}"
     assert main(["run", str(field), "--source", source, "--report", str(tmp_path / "file")]) == 2
     assert "its folder cannot be made" in capsys.readouterr().err
+
+
+def test_an_evaluation_has_a_page_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    field = demo_file("field.safetensors")
+    arguments = ["evaluate", field, field.parent, "--method", "one-step", "--method", "retrieved", "--seeds", 0]
+    arguments += ["--images", 2, "--poses", 1, "--size", 200, "--report", tmp_path / "out"]
+    assert main([str(argument) for argument in arguments]) == 0
+    assert "out/report.html: a page of the scores" in capsys.readouterr().out.replace("\n", "")
+    content = (tmp_path / "out/report.html").read_text()
+    elements = Elements(content)
+    assert [picture.shape for picture in elements.pictures()][1:] == [(200, 400, 3)] * 4
+    for words in (
+        "looked for with field.safetensors",
+        "2 pairs (seeds 0)",
+        "right of ok",
+        "the guess was",
+        "retrieved",
+    ):
+        assert words in elements.text
+    assert asks_for_nothing(content)
+
+
+def test_the_worst_answers_come_first() -> None:
+    def answer(shift: float | None, scale_known: bool = True) -> Answer:
+        found = None if shift is None else exp_se3(np.array([shift, 0, 0, 0, 0, 0])) @ POSE
+        return Answer(Pair(0, 0, POSE, POSE), found, None, 0.1, scale_known)
+
+    near, far, none, unscaled = answer(0.1), answer(0.4), answer(None), answer(0.9, scale_known=False)
+    ranked = worst_answers([near, unscaled, far, none], 3)
+    assert [id(one) for one in ranked] == [id(none), id(far), id(near)]
 
 
 RUN = [

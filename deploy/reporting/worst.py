@@ -117,5 +117,5 @@ def _of_pose(frame: FrameResult) -> str:
         words.append(f"the truth is outside the {_OUTSIDE:.0%} region")
     words.append(f"{frame.state}, score {frame.score:.2f}")
     if frame.reason is not None:
-        words.append(_in_words(frame.reason))
+        words.append(reason_in_words(frame.reason))
     return "; ".join(words)

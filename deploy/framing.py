@@ -16,7 +16,7 @@ from fieldpose.stages.nerf.surface.samples import sampled_surface
 
 _SANE = 1e-9, 1e9
 _PLAIN = 7.0
-"""Grey values that pixels differ by: on a can 12 to 36, on the plain floor around it, learnt up to 0.8 too low, 2 to 6."""
+"""Grey values that pixels differ by: on a can 12 to 36, on the plain floor around it, learnt far too low, 2 to 6."""
 PLANE = "plane"
 """In place of a direction or a point: that of what the object stands on."""
 

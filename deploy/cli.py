@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import difflib
 import importlib
 import io
 import re
@@ -79,7 +80,9 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     name, *rest = arguments
     if name not in COMMANDS:
-        raise UsageError(f"no command {name!r}; expected one of {', '.join(COMMANDS)}")
+        meant = difflib.get_close_matches(name, COMMANDS, 1)
+        hint = f" (did you mean {meant[0]}?)" if meant else ""
+        raise UsageError(f"no command {name!r}{hint}; expected one of {', '.join(COMMANDS)}")
     module = importlib.import_module(f"fieldpose.deploy.commands.{name}")
     return int(parse(module.Options, name, rest).run())
 

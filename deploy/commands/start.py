@@ -74,6 +74,8 @@ class Options:
     """The folder to write; by default out/ and the name of the source."""
     minutes: float | None = None
     """How long to learn, 5 by default; what it takes to look before and to try the field after comes on top."""
+    view: bool = False
+    """Serve a page that shows the run, and print its address; see `fieldpose view`."""
     only: Literal["box", "masks"] | None = None
     """Learn the object alone, so that it is found wherever it is moved: what is in the box that `capture` puts around
     it, or what masks show."""
@@ -168,7 +170,12 @@ class Options:
         into = folder / f"run-{_name_of(on)}"
         written = into / "poses.csv"
         options = run.Options(
-            (str(folder / FIELD),), (on,), json=into / "run.json", csv=written, plot=into / "timeline.png"
+            (str(folder / FIELD),),
+            (on,),
+            json=into / "run.json",
+            csv=written,
+            plot=into / "timeline.png",
+            view=self.view,
         )
         return _timed("run", f"{written}, timeline.png", options.run, rows)
 

@@ -64,7 +64,7 @@ def test_each_command_describes_itself_with_an_example(name: str, capsys: pytest
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["runn"], "no command 'runn'; expected one of demo, start, capture, convert, calibrate, train"),
+        (["runn"], "no command 'runn' (did you mean run?); expected one of demo, start, capture, convert"),
         (["run", "f", "--nonsense", "3"], "Unrecognized options: --nonsense"),
         (["run", "f", "--tracking.deth", "3"], "did you mean --tracking.depth?"),
         (["run"], "no field; give one, or several"),

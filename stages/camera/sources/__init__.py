@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from fieldpose.errors import SourceError
@@ -58,9 +59,16 @@ def knows_truth(source: str) -> bool:
     return source == EXTERNAL or _parse(source)[0].knows_truth
 
 
+def _meant(source: str) -> str:
+    """What a file or folder without its kind before it is likely to be."""
+    path = Path(source)
+    kind = "folder" if path.is_dir() else {".mcap": "mcap", ".bag": "bag"}.get(path.suffix, "video")
+    return f"; is {kind}:{source} meant?" if source and path.exists() else ""
+
+
 def _parse(source: str) -> tuple[Kind, str]:
     name, _, rest = source.partition(":")
     if name not in KINDS or not rest:
         examples = ", ".join([*(kind.example for kind in KINDS.values()), EXTERNAL])
-        raise SourceError(f"source {source!r}: expected one of {examples}")
+        raise SourceError(f"source {source!r}: expected one of {examples}{_meant(source)}")
     return KINDS[name], rest

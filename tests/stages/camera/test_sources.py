@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -448,3 +449,15 @@ def test_real_photographs_as_a_dataset_and_as_a_folder() -> None:
     assert any(frame.camera.distortion)
     loose = next(open_source(CameraConfig(f"folder:{fox / 'images'}")).frames(0))
     assert loose.encoding == "jpeg"
+
+
+def test_a_file_without_its_kind_is_told_which_it_is_likely_to_be(tmp_path: Path) -> None:
+    for name, meant in (("film.mp4", "video"), ("run.mcap", "mcap"), ("robot.bag", "bag")):
+        (tmp_path / name).write_bytes(b"")
+        with pytest.raises(SourceError, match=re.escape(f"is {meant}:{tmp_path / name} meant?")):
+            is_video(str(tmp_path / name))
+    with pytest.raises(SourceError, match=re.escape(f"is folder:{tmp_path} meant?")):
+        is_video(str(tmp_path))
+    with pytest.raises(SourceError) as said:
+        is_video("nowhere.mp4")
+    assert "meant" not in str(said.value)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,9 +15,9 @@ import numpy as np
 
 from fieldpose.deploy.reporting.boxes import boxed, sheet
 from fieldpose.deploy.reporting.output import write_bytes, write_json
-from fieldpose.deploy.reporting.overlay import encoded
+from fieldpose.deploy.reporting.overlay import captioned, encoded
 from fieldpose.deploy.shots import FILMED_S, IMAGES, MASKS, Report, Shot, Shots, read_shots
-from fieldpose.errors import DatasetError, GeometryError
+from fieldpose.errors import DatasetError, GeometryError, OutputError
 from fieldpose.stages.cores import usable_cores
 from fieldpose.stages.geometry import Camera, scale_pixels
 from fieldpose.stages.images import shrunk
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 CAMERA_FILE = "camera.json"
 OBJECT_PICTURE = "object.jpg"
 _PICTURES = 6
+_THUMBNAILS, _ACROSS, _THUMBNAIL_PX = 24, 6, 200
 HELD_OUT_EVERY = 10
 """One in so many images is not learnt from, and tells how good the field is."""
 FEWEST = 8
@@ -88,7 +91,11 @@ def capture(
     where the source cannot be read, and DatasetError where too few cameras are found, or no such marker, which tells
     why; then nothing is written.
     """
-    shots = read_shots(source, most, size, seconds, report)
+    filming = out.with_name(f"{out.name}.filming.jpg")
+    try:
+        shots = read_shots(source, most, size, seconds, report, partial(_show_kept, filming))
+    finally:
+        filming.unlink(missing_ok=True)
     if len(shots.chosen) < FEWEST:
         blurred = f"; {len(shots.blurred)} were left out as blurred, so move slowly" if shots.blurred else ""
         film = "film longer, moving around the object, in a good light; frames without motion or texture are left out"
@@ -116,6 +123,15 @@ def capture(
             " wide, or in the camera's linear mode"
         ) from error
     return _write(out, shots, mapped, structure, marker, report)
+
+
+def _show_kept(path: Path, kept: Sequence[Shot], blurred: int) -> None:
+    """A picture of what a camera has filmed so far, evenly along its way."""
+    some = [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, min(_THUMBNAILS, len(kept))).astype(int))]
+    pictures = [shrunk(shot.image(), _THUMBNAIL_PX) for shot in some]
+    told = f"{len(kept)} frames kept, {blurred} blurred"
+    with suppress(OutputError):
+        write_bytes(path, encoded(captioned(sheet(pictures, _ACROSS, _THUMBNAIL_PX), [told]), path))
 
 
 def summary(why: dict[str, str]) -> str:

@@ -34,6 +34,7 @@ from fieldpose.stages.nerf.datasets.masks import FOLDER as MASKS
 from fieldpose.stages.nerf.datasets.masks import find_masks
 
 Report = Callable[[str, float], None]
+_LOOKED_EVERY_S = 3.0
 FILMED_S = 60.0
 """A live camera films for so long, if it is not told otherwise."""
 IMAGES = "images"
@@ -73,6 +74,9 @@ class Shot:
         return self.image()
 
 
+Look = Callable[[Sequence[Shot], int], None]
+
+
 @dataclass(frozen=True)
 class Shots:
     """What was chosen of a source, how many images it has, those left out as blurred, and what is known of the lens.
@@ -89,12 +93,17 @@ class Shots:
     notes: tuple[str, ...] = ()
 
 
-def read_shots(source: str, most: int, size: int, seconds: float, report: Report) -> Shots:
-    """Of a video file, a folder of photographs, or a source as `run` takes it; see capturing.capture. SourceError."""
+def read_shots(
+    source: str, most: int, size: int, seconds: float, report: Report, look: Look = lambda kept, blurred: None
+) -> Shots:  # fmt: skip
+    """Of a video file, a folder of photographs, or a source as `run` takes it; see capturing.capture. SourceError.
+
+    look: while a live camera films, is given now and then what would be kept, and how many frames are blurred.
+    """
     found = opened(source)
     if isinstance(found, Path):
         return _photographs(found, size, report)
-    return _frames(found, most, size, seconds, report)
+    return _frames(found, most, size, seconds, report, look)
 
 
 def opened(source: str) -> Path | Source:
@@ -198,15 +207,24 @@ def _check_shapes(source: Path | str, sizes: set[tuple[int, int]]) -> None:
         )
 
 
-def _frames(source: Source, most: int, size: int, seconds: float, report: Report) -> Shots:
+def _frames(source: Source, most: int, size: int, seconds: float, report: Report, look: Look) -> Shots:
     from fieldpose.stages.structure.selection import Chooser, Meter
 
     meter, chooser = Meter(), Chooser[Shot](most)
+    looked_at, so_far = time.monotonic(), ""
+
+    def told(what: str, share: float) -> None:
+        report(what + so_far, share)
+
     try:
-        for image in filmed(source, seconds, report):
+        for image in filmed(source, seconds, told):
             measured = meter(image)
             if chooser.wants(measured):
                 chooser.keep(measured, _shot(f"{chooser.seen - 1:05d}", image, size))
+            if source.clock == "wall" and time.monotonic() - looked_at > _LOOKED_EVERY_S:
+                kept, blurred = chooser.chosen()
+                look([candidate.payload for candidate in kept], len(blurred))
+                looked_at, so_far = time.monotonic(), f": {len(kept)} frames kept, {len(blurred)} blurred"
     except KeyboardInterrupt:
         if source.clock != "wall":
             raise

@@ -47,7 +47,8 @@ class Options:
     size: int = 1600
     """Images whose longer side has more pixels are shrunk to it."""
     seconds: float = FILMED_S
-    """How long a live camera films; Ctrl-C ends it as well, and what was filmed is used."""
+    """How long a live camera films; Ctrl-C ends it as well, and what was filmed is used. Meanwhile a picture beside the
+    folder (OUT.filming.jpg) shows every three seconds what has been covered."""
     marker: float | None = None
     """Length of a printed marker's side in metres, its black square: with such a marker in view, beside or under the
     object, lengths are in metres, z is out of the marker, x to its right, and the origin in its middle."""

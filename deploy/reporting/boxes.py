@@ -29,20 +29,20 @@ def boxed(image: np.ndarray, camera: Camera, cam_from_object: np.ndarray, box: n
     return picture
 
 
-def sheet(pictures: Sequence[np.ndarray], columns: int = 3) -> np.ndarray:
+def sheet(pictures: Sequence[np.ndarray], columns: int = 3, height: int = _HEIGHT) -> np.ndarray:
     """Pictures (h, w, 3) uint8 beside and below each other, all as high, on white."""
     shrunk = []
     for picture in pictures:
-        scale = _HEIGHT / picture.shape[0]
-        size = max(1, round(picture.shape[1] * scale)), _HEIGHT
+        scale = height / picture.shape[0]
+        size = max(1, round(picture.shape[1] * scale)), height
         shrunk.append(cv2.resize(picture, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR))
     rows = [shrunk[i : i + columns] for i in range(0, len(shrunk), columns)]
     across = max(sum(p.shape[1] + _GAP for p in row) - _GAP for row in rows)
-    whole = np.full((len(rows) * (_HEIGHT + _GAP) - _GAP, across, 3), 255, np.uint8)
+    whole = np.full((len(rows) * (height + _GAP) - _GAP, across, 3), 255, np.uint8)
     for i, row in enumerate(rows):
         left = 0
         for picture in row:
-            whole[i * (_HEIGHT + _GAP) :][:_HEIGHT, left : left + picture.shape[1]] = picture
+            whole[i * (height + _GAP) :][:height, left : left + picture.shape[1]] = picture
             left += picture.shape[1] + _GAP
     return whole
 

@@ -188,7 +188,7 @@ def test_a_marker_gives_frame_and_metres(tmp_path: Path) -> None:
 def test_a_live_camera_films_until_the_time_is_over_or_ctrl_c(
     pictures: list[np.ndarray], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ends_by: str
 ) -> None:
-    now = 0.0
+    now, preview, shown = 0.0, tmp_path / "out.filming.jpg", list[tuple[int, ...]]()
 
     def film(first: int) -> Iterator[CapturedFrame]:
         nonlocal now
@@ -196,11 +196,19 @@ def test_a_live_camera_films_until_the_time_is_over_or_ctrl_c(
             if ends_by == "Ctrl-C" and i == len(pictures):
                 raise KeyboardInterrupt
             now += 0.1
+            if preview.exists():
+                shown.append(cv2.imread(str(preview)).shape)
             yield CapturedFrame(i, pictures[min(i, len(pictures) - 1)], "rgb8", LENS, f"{i}")
 
     monkeypatch.setattr(shots, "open_source", lambda config: Source("camera:0", "wall", film))
     monkeypatch.setattr(shots.time, "monotonic", lambda: now)
-    captured = capture("camera:0", tmp_path / "out", 150, 400, 2, seconds=6.0)
+    told: list[str] = []
+    captured = capture("camera:0", tmp_path / "out", 150, 400, 2, lambda what, share: told.append(what), seconds=6.0)
+    # It grows by rows of what has been covered, and is gone when that is over.
+    assert len(shown) > 5
+    assert shown[0][1] > 900
+    assert not preview.exists()
+    assert any("frames kept, 0 blurred" in what for what in told)
     assert captured.images >= 25
     assert captured.seen == (len(pictures) if ends_by == "Ctrl-C" else pytest.approx(60, abs=1))
 

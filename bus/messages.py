@@ -355,6 +355,11 @@ class State(Message, kw_only=True):
     level: int = 0
     _arrays: ClassVar = {"cam_from_object": POSE, "covariance": COVARIANCE}
 
+    @property
+    def is_sure(self) -> bool:
+        """Whether its pose was measured, in this very frame, and tracking is sure of it."""
+        return self.cam_from_object is not None and self.score > 0 and self.state is TrackingState.TRACKING
+
 
 class Control(Message, kw_only=True):
     """What tracking was asked for from outside, and has done, at the header's capture time.

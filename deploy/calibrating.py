@@ -100,10 +100,10 @@ def _in_words(board: Board) -> str:
 def _look_at_photographs(folder: Path, gallery: _Gallery, report: Report) -> tuple[str, ...]:
     paths, left = photographs(folder)
     # Turned otherwise, the lens would be as well, and its principal point elsewhere.
-    turned = Counter(orientation(path) for path in paths)
-    usual = turned.most_common(1)[0][0]
-    others = [path.name for path in paths if orientation(path) != usual]
-    for _, image, _ in of_one_lens(folder, [path for path in paths if path.name not in others], report):
+    turned = {path: orientation(path) for path in paths}
+    usual = Counter(turned.values()).most_common(1)[0][0]
+    others = [path.name for path in paths if turned[path] != usual]
+    for _, image, _ in of_one_lens(folder, [path for path in paths if turned[path] == usual], report):
         gallery.look(image, alone=True)
     if others:
         left += (f"{len(others)} photographs count for nothing, since the camera was held otherwise, as {others[0]}",)

@@ -130,6 +130,7 @@ def _show_kept(path: Path, kept: Sequence[Shot], blurred: int) -> None:
     some = [kept[i] for i in np.unique(np.linspace(0, len(kept) - 1, min(_THUMBNAILS, len(kept))).astype(int))]
     pictures = [shrunk(shot.image(), _THUMBNAIL_PX) for shot in some]
     told = f"{len(kept)} frames kept, {blurred} blurred"
+    # No reason to stop filming.
     with suppress(OutputError):
         write_bytes(path, encoded(captioned(sheet(pictures, _ACROSS, _THUMBNAIL_PX), [told]), path))
 

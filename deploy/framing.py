@@ -15,7 +15,7 @@ from fieldpose.stages.nerf.rendering_api import RayRenderer
 from fieldpose.stages.nerf.surface.samples import sampled_surface
 
 _SANE = 1e-9, 1e9
-_PLAIN = 7.0
+PLAIN = 7.0
 """Grey values that pixels differ by: on a can 12 to 36, on the plain floor around it, learnt far too low, 2 to 6."""
 PLANE = "plane"
 """In place of a direction or a point: that of what the object stands on."""
@@ -41,7 +41,7 @@ class Framing:
             return np.array(numbers(spot, 3, "a point X,Y,Z, or IMAGE:X,Y"))
         x, y = numbers(pixel, 2, "a pixel X,Y after the image's name")
         point = shown_at(self._renderer, self._given, name, x, y)
-        if texture_at(self._renderer, self._given, name, x, y) < _PLAIN:
+        if texture_at(self._renderer, self._given, name, x, y) < PLAIN:
             self.notes.append(f"{spot} is on a surface with little texture, of which a field may not know where it is")
         return point
 

@@ -15,7 +15,7 @@ from fieldpose.bus.ports import Inbox, Outbox
 from fieldpose.bus.protocol import SETTLE_S, Bus, Sink
 from fieldpose.bus.ros2 import RosNames, RosNode, RosTopic
 from fieldpose.bus.topics import CAMERA_INFO, PRIOR, STATE, Address
-from fieldpose.deploy.bridges.ros_messages import DIAGNOSTICS, ODOMETRY, POSE, TF, RosMessages, is_sure
+from fieldpose.deploy.bridges.ros_messages import DIAGNOSTICS, ODOMETRY, POSE, TF, RosMessages, is_published
 from fieldpose.errors import ConfigError, FieldposeError
 from fieldpose.stages.camera.ros import (
     COMPRESSED,
@@ -112,7 +112,7 @@ class RosBridge:
             inbox.close()
 
     def _publish(self, state: State) -> None:
-        if not is_sure(state):
+        if not is_published(state):
             return
         makers = {POSE: self._messages.pose, ODOMETRY: self._messages.odometry, TF: self._messages.tf}
         for kind, send in self._senders.items():

@@ -75,10 +75,9 @@ class Frames:
         return from_rotation(Rotation.from_euler("xyz", self.mount[3:]), self.mount[:3]) @ BODY_FROM_OPTICAL
 
 
-def is_sure(state: State) -> bool:
-    """Whether a state is published as a pose: tracking trusts it, and has measured it in this very frame."""
-    known = state.cam_from_object is not None and state.covariance is not None
-    return known and state.state is TrackingState.TRACKING and state.score > 0
+def is_published(state: State) -> bool:
+    """Whether a state is published as a pose: tracking is sure of it, and of how sure it is."""
+    return state.is_sure and state.covariance is not None
 
 
 def pose_in_ros(

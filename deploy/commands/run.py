@@ -22,7 +22,7 @@ from fieldpose.deploy.rig import planned_rig, read_rig
 from fieldpose.deploy.settings import Settings, overridden
 from fieldpose.deploy.viewing.beside import page_beside
 from fieldpose.stages.camera.config import Pace
-from fieldpose.stages.nerf.field import load_field
+from fieldpose.stages.nerf.field import load_field, load_metadata
 from fieldpose.stages.nerf.training_views import training_views
 
 INTERRUPTED = 130
@@ -200,7 +200,7 @@ def _title(plan: Plan, several: bool) -> str:
 
 
 def _unit(plan: Plan) -> str:
-    return in_words(None if plan.field is None else load_field(plan.field).metadata)
+    return in_words(None if plan.field is None else load_metadata(plan.field))
 
 
 def _of_pipeline(path: Path, pair: str, several: bool) -> Path:

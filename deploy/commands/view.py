@@ -17,7 +17,7 @@ import tyro
 from fieldpose.bus.ports import Inbox
 from fieldpose.bus.replay import info
 from fieldpose.bus.signals import StopSignals
-from fieldpose.bus.topics import STATE, Address
+from fieldpose.bus.topics import FRAME, STATE, Address
 from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
 from fieldpose.connection import Connection
 from fieldpose.deploy.processes.endpoints import peer_address
@@ -37,7 +37,7 @@ _PICTURES_HZ = 10.0
 _RATE_S = 3.0
 _NICE = 10
 """Lower than what tracks: the page is what waits, where there are too few cores."""
-_QUEUED = 512
+_QUEUED, _IMAGES = 512, 8
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,9 @@ class Options:
         bus = ZenohBus(self.connect, peer_address(self.connect))
         try:
             bus.wait_for_hub(_HUB_S)
-            inbox = Inbox(bus, self.address, WATCHED, dict.fromkeys(WATCHED, _QUEUED))
+            inbox = Inbox(
+                bus, self.address, WATCHED, {topic: _IMAGES if topic is FRAME else _QUEUED for topic in WATCHED}
+            )
             page = self._page(field, self.address.pair, self._actions())
             self._say(page)
             return self._serve(page, _Live(inbox, page).update)

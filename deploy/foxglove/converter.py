@@ -161,7 +161,7 @@ class Converter:
             yield channels.TRUTH, lambda: drawing.pose_in_object(pose, at)
 
     def _state(self, state: State) -> Iterator[tuple[Channel, Callable[[], Any]]]:
-        at, pose, sure = state.header.capture_ns, state.cam_from_object, is_sure(state)
+        at, pose, sure = state.header.capture_ns, state.cam_from_object, state.is_sure
         yield from self._news(state)
         if pose is not None:
             channel, frame = (channels.POSE, drawing.CAMERA) if sure else (channels.UNSURE, drawing.UNSURE)
@@ -194,11 +194,6 @@ class Converter:
     def _rate_hz(self) -> float | None:
         span_s = (self._states[-1] - self._states[0]) / 1e9
         return (len(self._states) - 1) / span_s if span_s > 0 else None
-
-
-def is_sure(state: State) -> bool:
-    """Whether its pose was measured, and tracking is sure of it."""
-    return state.cam_from_object is not None and state.score > 0 and state.state == TrackingState.TRACKING
 
 
 def _matched(pixels: np.ndarray) -> tuple[str, np.ndarray, drawing.Colour]:

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from fieldpose.deploy.framing import PLAIN
 from fieldpose.deploy.reporting.overlay import encoded
 from fieldpose.errors import ConfigError
 from fieldpose.stages.geometry import inverse
-from fieldpose.stages.nerf.framing import SOLID
+from fieldpose.stages.nerf.framing import AGREE, SOLID
 from fieldpose.stages.nerf.metadata import FieldMetadata
 from fieldpose.stages.nerf.rendering_api import RayRenderer, RenderedView
 
@@ -34,6 +35,7 @@ def page(renderer: RayRenderer, metadata: FieldMetadata, path: Path) -> bytes:
         for view in metadata.cameras[:: -(-len(metadata.cameras) // _VIEWS)]
     ]
     known = {"views": views, "field": shlex.quote(str(path)), "metres_per_unit": metadata.metres_per_unit}
+    known |= {"plain": PLAIN, "agree": AGREE}
     # "<" might close the script that the values stand in.
     text = json.dumps(known).replace("<", "\\u003c")
     return _TEMPLATE.read_text(encoding="utf-8").replace(_PLACE, text).encode()

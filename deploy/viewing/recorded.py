@@ -9,10 +9,11 @@ from typing import cast
 import numpy as np
 
 from fieldpose.bus.messages import Frame, TrackingState
-from fieldpose.bus.replay import info, read_recording, recorded_at
-from fieldpose.bus.topics import FRAME, STATE
+from fieldpose.bus.replay import read_recording, recorded_at
+from fieldpose.bus.topics import FRAME
+from fieldpose.deploy.reporting.gathering import recorded_pipeline
 from fieldpose.deploy.viewing.moments import WATCHED, Moment, Moments
-from fieldpose.errors import RecordingError, UsageError
+from fieldpose.errors import RecordingError
 
 
 class RecordedMoments:
@@ -22,13 +23,7 @@ class RecordedMoments:
     """
 
     def __init__(self, path: Path, pipeline: str | None = None) -> None:
-        found = [STATE.address_of(topic.key) for topic in info(path).topics if topic.topic == STATE.name]
-        addresses = {address.pair: address for address in found if address is not None}
-        if not addresses:
-            raise RecordingError(f"{path}: holds no states of tracking, so nothing to look at")
-        if pipeline not in addresses and (pipeline is not None or len(addresses) > 1):
-            raise UsageError(f"{path}: holds the pipelines {', '.join(sorted(addresses))}; choose one with --pipeline")
-        address = addresses[pipeline or next(iter(addresses))]
+        address = recorded_pipeline(path, pipeline)
         moments = Moments(kept=None)
         self._path, self._key = path, address.key(FRAME)
         self._when: dict[tuple[int, int], int] = {}
@@ -40,6 +35,8 @@ class RecordedMoments:
                 continue
             moments.note(recorded.message)
         self.all: Sequence[Moment] = sorted(moments.answered(), key=lambda m: (m.capture_ns, m.frame_id))
+        if not self.all:
+            raise RecordingError(f"{path}: holds no states of tracking, so nothing to look at")
 
     def __len__(self) -> int:
         return len(self.all)

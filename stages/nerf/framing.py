@@ -16,8 +16,8 @@ OWN_UNIT = "unit that was chosen for the field"
 SOLID = 0.5
 """Opacity of a ray that meets a surface."""
 _AROUND_PX = 4
-_ASKED, _FEWEST_AGREED = 40, 2
-_AGREE = 0.03
+_ASKED, _FEWEST = 40, 2
+AGREE = 0.03
 """Of the distance, by which views may see a surface elsewhere: a can's is seen to 0.01, a plain floor's anywhere."""
 
 
@@ -59,12 +59,10 @@ def in_dataset_frame(metadata: FieldMetadata) -> FieldMetadata:
 def shown_at(renderer: RayRenderer, metadata: FieldMetadata, name: str, x: float, y: float) -> np.ndarray:
     """The point (3,) of the surface that a training view shows at a pixel, by the size that it was learnt at.
 
-    DatasetError where there is no such view; ConfigError where the pixel is outside, or shows nothing.
+    DatasetError where there is no such view; ConfigError where the pixel is outside, shows nothing, or what it shows is
+    elsewhere for other views.
     """
-    names = [camera.name for camera in metadata.cameras]
-    if not names:
-        raise ConfigError(f"the field does not tell its training views, so {name}:{x:g},{y:g} means nothing")
-    view = metadata.cameras[names.index(find_name(names, name))]
+    view = _view_named(metadata, name)
     if not (-0.5 <= x <= view.width - 0.5 and -0.5 <= y <= view.height - 0.5):
         raise ConfigError(f"pixel {x:g},{y:g} is not in {view.name}, which was learnt at {view.width}x{view.height}")
     origins, directions = rays(view.camera, view.pose, np.array([[x, y]]))
@@ -73,7 +71,7 @@ def shown_at(renderer: RayRenderer, metadata: FieldMetadata, name: str, x: float
         raise ConfigError(f"{view.name} shows nothing solid at pixel {x:g},{y:g}; name another one")
     point: np.ndarray = origins[0] + float(traced.depth[0]) * directions[0]
     agreed, doubted = _seen_by_others(renderer, metadata, point)
-    if agreed < max(_FEWEST_AGREED, doubted):
+    if agreed < max(_FEWEST, doubted):
         raise ConfigError(
             f"how far it is to what {view.name} shows at pixel {x:g},{y:g} is not known: {agreed} other views see a"
             f" surface there, {doubted} see past it; choose a place with texture"
@@ -86,13 +84,19 @@ def texture_at(renderer: RayRenderer, metadata: FieldMetadata, name: str, x: flo
 
     Of surfaces that look the same all over, no two images tell where they are.
     """
-    names = [camera.name for camera in metadata.cameras]
-    view = metadata.cameras[names.index(find_name(names, name))]
+    view = _view_named(metadata, name)
     around = np.arange(-_AROUND_PX, _AROUND_PX + 1)
     pixels = np.stack(np.meshgrid(x + around, y + around), axis=-1).reshape(-1, 2)
     origins, directions = rays(view.camera, view.pose, pixels)
     seen = renderer.render_rays(origins.astype(np.float32), directions.astype(np.float32))
     return float(255 * seen.rgb.mean(axis=1).std())
+
+
+def _view_named(metadata: FieldMetadata, name: str) -> TrainingCamera:
+    names = [camera.name for camera in metadata.cameras]
+    if not names:
+        raise ConfigError(f"the field does not tell its training views, so {name} means nothing")
+    return metadata.cameras[names.index(find_name(names, name))]
 
 
 def _seen_by_others(renderer: RayRenderer, metadata: FieldMetadata, point: np.ndarray) -> tuple[int, int]:
@@ -104,8 +108,8 @@ def _seen_by_others(renderer: RayRenderer, metadata: FieldMetadata, point: np.nd
         return 0, 0
     traced = renderer.render_rays(centres[within].astype(np.float32), (point - centres[within]).astype(np.float32))
     solid = traced.opacity >= SOLID
-    there = solid & (np.abs(traced.depth - 1) <= _AGREE)
-    past = (traced.depth > 1 + _AGREE) | ~solid
+    there = solid & (np.abs(traced.depth - 1) <= AGREE)
+    past = (traced.depth > 1 + AGREE) | ~solid
     return int(there.sum()), int(past.sum())
 
 

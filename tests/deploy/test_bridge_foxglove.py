@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -12,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import pytest
 from support import bus_samples
-from support.commands import command
+from support.commands import in_process
 from support.foxglove import Client, groups, rigid
 from support.pictures import needs
 from websockets.sync.client import connect
@@ -146,20 +144,6 @@ def test_where_no_hub_is(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     hub = f"tcp/127.0.0.1:{free_port()}"
     assert main(["bridge", "foxglove", "--connect", hub, "--port", "0"]) == 2
     assert f"no hub answers at {hub}" in capsys.readouterr().err
-
-
-@contextmanager
-def in_process(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """`fieldpose` with these arguments; it and all that it started are gone in the end."""
-    running = subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        yield running
-    finally:
-        processes = psutil.Process(running.pid).children(recursive=True) if running.poll() is None else []
-        running.send_signal(signal.SIGINT)
-        running.communicate(timeout=ENOUGH_S)
-        _, alive = psutil.wait_procs(processes, timeout=ENOUGH_S)
-        assert all(process.status() == psutil.STATUS_ZOMBIE for process in alive)
 
 
 @pytest.mark.slow

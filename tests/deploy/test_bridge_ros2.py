@@ -45,7 +45,7 @@ from fieldpose.deploy.bridges.ros_messages import (
     TF,
     Frames,
     RosMessages,
-    is_sure,
+    is_published,
     pose_in_ros,
 )
 from fieldpose.deploy.cli import main, parse
@@ -195,10 +195,10 @@ def test_diagnostics_without_a_state_are_stale() -> None:
 
 
 def test_only_what_tracking_is_sure_of_is_a_pose() -> None:
-    assert is_sure(state())
-    assert not is_sure(state(score=0.0))
-    assert not is_sure(state(covariance=None))
-    assert not any(is_sure(state(kind)) for kind in TrackingState if kind is not TrackingState.TRACKING)
+    assert is_published(state())
+    assert not is_published(state(score=0.0))
+    assert not is_published(state(covariance=None))
+    assert not any(is_published(state(kind)) for kind in TrackingState if kind is not TrackingState.TRACKING)
 
 
 @pytest.mark.parametrize("frames", [Frames(), Frames(base="base_link", mount=MOUNT)])

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import base64
-import html
 import json
 import re
 import shlex
-import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support.browser import Browser, needs_browser
 from support.surfaces import BALL_RADIUS, ball_field
 
 from fieldpose.deploy.cli import main
@@ -31,9 +29,8 @@ from fieldpose.stages.nerf.field import load_field, load_metadata
 from fieldpose.stages.nerf.framing import reframed
 
 FLOOR = -0.66
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 CLICKS = """
-addEventListener("load", async () => {
+(async () => {
   await Promise.all(known.views.map((view) => view.picture.decode()));
   const canvas = document.getElementById("canvas");
   const click = (what, x, y) => {
@@ -49,7 +46,7 @@ addEventListener("load", async () => {
   const metres = document.getElementById("metres");
   metres.value = "0.25";
   metres.dispatchEvent(new Event("input"));
-});
+})()
 """
 
 
@@ -161,18 +158,15 @@ def test_poses_are_found_in_the_new_frame(tmp_path: Path) -> None:
     assert translation_error(found, truth) < 0.02 * moved.scale
 
 
-@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+@needs_browser
 def test_clicks_in_a_browser_put_the_command_together(field: Path, tmp_path: Path) -> None:
     out = tmp_path / "page.html"
     assert main(["frame", str(field), "--page", str(out)]) == 0
-    out.write_text(out.read_text().replace("</html>", f"<script>{CLICKS}</script></html>"))
-    dumped = subprocess.run(
-        [str(CHROMIUM), "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=5000", "--dump-dom",
-         f"--user-data-dir={tmp_path / 'profile'}", f"file://{out}"],
-        capture_output=True, text=True, timeout=60, check=True,
-    ).stdout  # fmt: skip
-    told = re.search(r'<pre id="command">([^<]*)</pre>', dumped)[1]
-    words = shlex.split(html.unescape(told))
+    with Browser(out.as_uri(), tmp_path / "profile") as browser:
+        browser.wait_for("document.readyState === 'complete' && typeof known === 'object'")
+        browser.ask(CLICKS)
+        told = browser.wait_for("document.getElementById('command').textContent")
+    words = shlex.split(told)
     assert words[:3] == ["fieldpose", "frame", str(field)]
     up, origin, option, *distance = words[3:]
     assert (up.partition("=")[0], origin.partition("=")[0], option) == ("--up", "--origin", "--known-distance")

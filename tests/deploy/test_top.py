@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import re
-import signal
-import subprocess
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import psutil
 import pytest
 from rich.console import Console
-from support.commands import command, fieldpose
+from support.commands import fieldpose, in_process
 from support.pictures import needs
 
 from fieldpose.bus.messages import CameraInfo, Header, Message, State, Stats, TrackingState
@@ -198,17 +193,3 @@ def test_a_running_pipeline_is_seen_from_another_process(tmp_path: Path) -> None
     rows = {cells[0]: cells for line in lines if line.startswith("│") for cells in [line.strip("│ ").split("│")]}
     named = {name.strip() for name in rows}
     assert {"camera", "tracking", "rendering", "matching", "pnp"} <= named <= set(STAGES)
-
-
-@contextmanager
-def in_process(*arguments: object) -> Iterator[subprocess.Popen[str]]:
-    """`fieldpose` with these arguments; it and all that it started are gone in the end."""
-    running = subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    try:
-        yield running
-    finally:
-        processes = psutil.Process(running.pid).children(recursive=True) if running.poll() is None else []
-        running.send_signal(signal.SIGINT)
-        running.communicate(timeout=ENOUGH_S)
-        _, alive = psutil.wait_procs(processes, timeout=ENOUGH_S)
-        assert all(process.status() == psutil.STATUS_ZOMBIE for process in alive)

@@ -6,6 +6,7 @@ those of ROS 2 have k, d and p.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import cv2
@@ -31,6 +32,8 @@ _COLOURS: dict[str, tuple[type[np.generic], int, int | None]] = {
     "yuv422_yuy2": (np.uint8, 2, cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": (np.uint8, 2, cv2.COLOR_YUV2RGB_YUY2),
 }
+# What OpenCV has for arrays; of 8 bits they may well be pictures.
+_NUMBERS = re.compile(r"(16U|16S|32S|32F|64F)C\d*")
 # ROS names a pattern by its first two rows, as OpenCV's newer names do.
 _PATTERNS = {
     "rggb": cv2.COLOR_BayerRGGB2RGB,
@@ -91,9 +94,9 @@ def is_rectified(image_topic: str) -> bool:
 
 
 def stamp_ns(message: Any) -> int:
-    """A message's own time in nanoseconds, 0 where it has none."""
+    """A message's own time in nanoseconds, 0 where it has none, as before the epoch."""
     stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+    return max(int(stamp.sec) * 10**9 + int(stamp.nanosec), 0)
 
 
 def _field(message: Any, name: str) -> Any:
@@ -130,6 +133,8 @@ def _compressed(message: Any) -> tuple[np.ndarray, Encoding]:
         raise SourceError(f"a compressed image of format {message.format!r} is neither jpeg nor png; convert it")
     # "bayer_rggb8; jpeg compressed bgr8" was unfolded before it was compressed, with nothing at the end it was not.
     original, _, target = str(message.format).partition(";")
+    if _NUMBERS.fullmatch(original.strip()):
+        raise SourceError(f"a compressed image of format {message.format!r} holds numbers, as of depth, and no picture")
     known = _COLOURS.get(original.strip()) if original.startswith("bayer_") else None
     if known is None or target.split()[-1:] in (["bgr8"], ["rgb8"], ["mono8"]):
         return file, encoding

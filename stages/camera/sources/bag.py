@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 _KINDS = (".bag", ".mcap", ".db3")
+_STAMPED_WITHIN = 10
+_ZSTD = b"\x28\xb5\x2f\xfd"
 _DAMAGE = (OSError, ValueError, KeyError, IndexError, AssertionError, EOFError, struct.error)
 
 
@@ -60,6 +63,20 @@ class _Image(NamedTuple):
     calibration: Calibration
 
 
+class _Message(NamedTuple):
+    """An image of ROS, taken at at_ns, with the camera of the CameraInfo stamped told_ns, None for the bag's first."""
+
+    image: Any
+    at_ns: int
+    number: int
+    told: Camera | None
+    told_ns: int | None
+
+    def is_of(self, told_ns: int) -> bool:
+        """Whether a CameraInfo of that stamp is its own, where none was so far."""
+        return stamp_ns(self.image) == told_ns != self.told_ns
+
+
 @dataclass(frozen=True)
 class _Bag:
     path: Path
@@ -81,27 +98,52 @@ class _Bag:
             yield CapturedFrame(number, pixels, encoding, camera, name, image.at_ns, origin=origin)
 
     def images(self, first: int) -> Iterator[_Image]:
-        """From that one on, each with the camera of the newest CameraInfo, or of the first one of all."""
-        told = self._first_camera()
-        with _opened(self.path) as reader:
-            number = 0
-            for connection, logged_ns, data in _messages(reader, [c for c in reader.connections if self._wants(c)]):
-                if connection.topic != self.topic:
-                    told = self._camera(reader.deserialize(data, INFO))
-                    continue
-                if number >= first:
-                    yield self._image(reader.deserialize(data, connection.msgtype), logged_ns, told, number)
-                number += 1
+        """From that one on, each with the CameraInfo of its stamp that is next to it, else the newest or the first one.
 
-    def _image(self, message: Any, logged_ns: int, told: Camera | None, number: int) -> _Image:
+        Recorders write an image and its CameraInfo in either order.
+        """
+        told, told_ns, ahead_ns = self._first_camera(), None, self._stamps_ahead_ns()
+        with _opened(self.path) as reader:
+            number, waiting = 0, None
+            for connection, logged_ns, data in self._messages(reader, self._wants):
+                if connection.topic != self.topic:
+                    info = reader.deserialize(data, INFO)
+                    told, told_ns = self._camera(info), stamp_ns(info)
+                    if waiting is not None and waiting.is_of(told_ns):
+                        waiting = waiting._replace(told=told, told_ns=told_ns)
+                    continue
+                if waiting is not None:
+                    yield self._image(waiting)
+                waiting = None
+                if number >= first:
+                    image = reader.deserialize(data, connection.msgtype)
+                    waiting = _Message(image, stamp_ns(image) or logged_ns + ahead_ns, number, told, told_ns)
+                number += 1
+            if waiting is not None:
+                yield self._image(waiting)
+
+    def _stamps_ahead_ns(self) -> int:
+        """How far stamps are ahead of the times of recording, which is years where they are of a simulation's clock.
+
+        0 where none of the first images has a stamp. It places images without one among those that have.
+        """
+        with _opened(self.path) as reader:
+            images = self._messages(reader, lambda connection: connection.topic == self.topic)
+            for connection, logged_ns, data in islice(images, _STAMPED_WITHIN):
+                stamped_ns = stamp_ns(reader.deserialize(data, connection.msgtype))
+                if stamped_ns:
+                    return stamped_ns - logged_ns
+        return 0
+
+    def _image(self, message: _Message) -> _Image:
+        number, told, at_ns = message.number, message.told, message.at_ns
         try:
-            pixels, encoding = image_of(message)
+            pixels, encoding = image_of(message.image)
         except SourceError as error:
             raise SourceError(f"{self.path}: image {number} on {self.topic}: {error}") from error
         size = encoded_size(pixels) if encoding != "rgb8" else (pixels.shape[1], pixels.shape[0])
         if size is None:
             raise self._unreadable(number)
-        at_ns = stamp_ns(message) or logged_ns
         if told is None:
             return _Image(pixels, encoding, at_ns, self.calibrator.of(*size))
         if (told.width, told.height) != size:
@@ -117,9 +159,22 @@ class _Bag:
 
     def _first_camera(self) -> Camera | None:
         with _opened(self.path) as reader:
-            for _, _, data in _messages(reader, [c for c in reader.connections if self._tells(c)]):
+            for _, _, data in self._messages(reader, self._tells):
                 return self._camera(reader.deserialize(data, INFO))
         return None
+
+    def _messages(
+        self, reader: AnyReader, wanted: Callable[[Connection], bool]
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """None where there are no such connections; of a reader that would be all messages."""
+        connections = [connection for connection in reader.connections if wanted(connection)]
+        for connection, logged_ns, data in reader.messages(connections) if connections else ():
+            if data[:4] == _ZSTD:
+                raise SourceError(
+                    f"{self.path}: its messages are compressed one by one, as the metadata.yaml beside it says; give"
+                    " the folder of the bag"
+                )
+            yield connection, logged_ns, data
 
     def _wants(self, connection: Connection) -> bool:
         return connection.topic == self.topic or self._tells(connection)
@@ -142,6 +197,8 @@ def _named(rest: str, config: CameraConfig, calibrator: Calibrator) -> _Bag:
     path = Path(rest) if Path(rest).exists() else Path(name)
     if not path.exists():
         raise SourceError(f"{path}: no such bag")
+    if path.suffix == ".zstd":
+        raise SourceError(f"{path}: a part of a bag, compressed as a whole; give the folder of the bag")
     if not path.is_dir() and path.suffix not in _KINDS:
         raise SourceError(f"{path}: expected a bag of ROS 1 (.bag) or of ROS 2 (.mcap, .db3 or its folder)")
     with _opened(path) as reader:
@@ -160,12 +217,6 @@ def _named(rest: str, config: CameraConfig, calibrator: Calibrator) -> _Bag:
         raise SourceError(f"{path}: images on {', '.join(images)}; choose a topic, for instance bag:{path}#{images[0]}")
     chosen = wanted or images[0]
     return _Bag(path, chosen, counts[chosen], config, calibrator)
-
-
-def _messages(reader: AnyReader, connections: list[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
-    """None where there are no such connections; of a reader that would be all messages."""
-    if connections:
-        yield from reader.messages(connections)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
@@ -75,21 +75,24 @@ def info(
 
 
 @contextmanager
-def writer(path: Path, kind: str) -> Iterator[Any]:
+def writer(path: Path, kind: str, compressed: CompressionMode | None = None) -> Iterator[Any]:
     if kind == "bag":
         with Writer1(path) as opened:
             yield opened
     else:
         plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-        with Writer2(path, version=9, storage_plugin=plugin) as opened:
+        made = Writer2(path, version=9, storage_plugin=plugin)
+        if compressed is not None:
+            made.set_compression(compressed, CompressionFormat.ZSTD)
+        with made as opened:
             yield opened
 
 
-def bag(root: Path, sent: Iterable[Sent], kind: str = "mcap") -> Path:
+def bag(root: Path, sent: Iterable[Sent], kind: str = "mcap", compressed: CompressionMode | None = None) -> Path:
     """Messages on topics, each recorded at a time, in a bag of that kind."""
     ros, path = (1, root / "a.bag") if kind == "bag" else (2, root / "a")
     store = STORES[ros]
-    with writer(path, kind) as out:
+    with writer(path, kind, compressed) as out:
         connections: dict[str, Any] = {}
         for topic, message, at_ns in sent:
             name = message.__msgtype__
@@ -225,6 +228,7 @@ def test_compressed_images_stay_as_they_are(tmp_path: Path, kind: str, suffix: s
             compressed(b"RVL of depth", "16UC1; compressedDepth"),
             "format '16UC1; compressedDepth' is neither jpeg nor png",
         ),
+        (compressed(b"\x89PNG", "16UC1; png compressed "), "'16UC1; png compressed ' holds numbers, as of depth"),
         (compressed(b"\xff\xd8\xff cut off", "jpeg"), "image 0 on /front/image_raw cannot be read"),
     ],
 )
@@ -254,6 +258,16 @@ def test_a_zoom_is_followed(tmp_path: Path) -> None:
         (INFO, info(), 1), (RAW, image(picture()), 2), (INFO, info(k=nearer), 3), (RAW, image(picture()), 4)
     ]  # fmt: skip
     assert [frame.camera.fx for frame in frames_of(bag(tmp_path, sent))] == [10.0, 20.0]
+
+
+def test_a_camera_info_that_is_recorded_after_its_image_is_the_images(tmp_path: Path) -> None:
+    nearer = replace(info(k=[20.0, *K[1:]]), header=header(2, BEGAN_NS + 5))
+    sent: list[Sent] = [
+        (RAW, image(picture()), 1), (INFO, info(), 2),
+        (RAW, image(picture(), at_ns=BEGAN_NS + 5), 3), (INFO, nearer, 4),
+        (RAW, image(picture(), at_ns=BEGAN_NS + 9), 5),
+    ]  # fmt: skip
+    assert [frame.camera.fx for frame in frames_of(bag(tmp_path, sent))] == [10.0, 20.0, 20.0]
 
 
 def test_lenses_that_are_not_supported_are_refused_by_name(tmp_path: Path) -> None:
@@ -295,6 +309,41 @@ def test_a_bag_that_tells_no_camera_has_an_assumed_one(tmp_path: Path, told: lis
 def test_an_image_without_a_stamp_was_taken_when_it_was_recorded(tmp_path: Path) -> None:
     (frame,) = frames_of(bag(tmp_path, [(RAW, image(picture(), at_ns=0), BEGAN_NS)]))
     assert frame.at_ns == BEGAN_NS
+
+
+@pytest.mark.parametrize(
+    ("stamps", "expected"),
+    [
+        ([0, 100, 200], [0, 100, 200]),
+        ([BEGAN_NS, 0, BEGAN_NS + 200], [BEGAN_NS, BEGAN_NS + 100, BEGAN_NS + 200]),
+        ([-(10**9), 0, BEGAN_NS + 200], [BEGAN_NS, BEGAN_NS + 100, BEGAN_NS + 200]),
+    ],
+    ids=["a simulation that begins at 0", "one is missing", "before the epoch"],
+)
+def test_images_without_a_stamp_are_among_those_that_have_one(
+    tmp_path: Path, stamps: list[int], expected: list[int]
+) -> None:
+    logged_ns = BEGAN_NS + 10**15
+    path = bag(tmp_path, [(RAW, image(picture(), at_ns=at), logged_ns + i * 100) for i, at in enumerate(stamps)])
+    assert [frame.at_ns for frame in frames_of(path)] == expected
+    assert [frame.at_ns for frame in frames_of(path, first=1)] == expected[1:]
+
+
+def test_an_image_before_the_epoch_was_taken_when_it_was_recorded(tmp_path: Path) -> None:
+    assert one(tmp_path, image(picture(), at_ns=-5)).at_ns == BEGAN_NS
+
+
+@pytest.mark.parametrize("kind", ["db3", "mcap"])
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_of_a_compressed_bag_the_folder_is_read_and_asked_for(tmp_path: Path, kind: str, mode: CompressionMode) -> None:
+    sent: list[Sent] = [(INFO, info(), BEGAN_NS), (RAW, image(picture()), BEGAN_NS)]
+    with suppress(StopIteration):  # the file's name has another ending
+        bag(tmp_path, sent, kind, mode)
+    (frame,) = frames_of(tmp_path / "a")
+    np.testing.assert_array_equal(frame.image, picture())
+    (alone,) = (path for path in (tmp_path / "a").iterdir() if path.suffix != ".yaml")
+    with pytest.raises(SourceError, match=r"compressed .*; give the folder of the bag"):
+        frames_of(alone)
 
 
 def test_of_several_topics_one_has_to_be_chosen(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from fieldpose.bus.protocol import SETTLE_S, Bus, Sink
 from fieldpose.bus.ros2 import RosNames, RosNode, RosTopic
 from fieldpose.bus.topics import CAMERA_INFO, PRIOR, STATE, Address
 from fieldpose.deploy.bridges.ros_messages import DIAGNOSTICS, ODOMETRY, POSE, TF, RosMessages, is_published
-from fieldpose.errors import ConfigError, FieldposeError
+from fieldpose.errors import ConfigError, FieldposeError, SourceError
 from fieldpose.stages.camera.ros import (
     COMPRESSED,
     IMAGE,
@@ -25,6 +25,7 @@ from fieldpose.stages.camera.ros import (
     image_of,
     info_topic,
     is_rectified,
+    size_of,
     stamp_ns,
 )
 from fieldpose.stages.camera.wire import frame_messages
@@ -33,6 +34,7 @@ from fieldpose.stages.geometry import Camera
 _POLL_S = 0.05
 _SAY_NS = 10**9
 _STALE_NS = 2 * 10**9
+_LATEST_NS = 60 * 10**9
 _PRIORS, _INFOS = 16, 4
 
 
@@ -91,7 +93,9 @@ class RosBridge:
         """Carry messages until `stop`."""
         inbox = Inbox(self._bus, self._address, (STATE, CAMERA_INFO))
         self._bus.settle(SETTLE_S)
-        newest, latency_ms, heard_ns, said_ns = None, 0.0, 0, 0
+        newest: State | None = None
+        latency_ms: float | None = None
+        heard_ns = said_ns = 0
         try:
             while not stop.is_set():
                 received = inbox.get(_POLL_S)
@@ -101,7 +105,7 @@ class RosBridge:
                     self._numbers.seen(received.message.header.frame_id)
                 elif received is not None and isinstance(received.message, State):
                     newest, heard_ns = received.message, now_ns
-                    latency_ms = (received.received_ns - newest.header.capture_ns) / 1e6
+                    latency_ms = _latency_ms(newest, received.received_ns)
                     self._publish(newest)
                 elif now_ns - heard_ns > _STALE_NS:
                     newest = None
@@ -118,7 +122,7 @@ class RosBridge:
         for kind, send in self._senders.items():
             send(makers[kind](state))
 
-    def _diagnose(self, state: State | None, now_ns: int, latency_ms: float) -> None:
+    def _diagnose(self, state: State | None, now_ns: int, latency_ms: float | None) -> None:
         if self._say is not None:
             self._say(self._messages.diagnostics(self._address.pair, now_ns, state, latency_ms))
 
@@ -132,14 +136,19 @@ class RosBridge:
         self._guesses.publish(PRIOR, Prior(header=header, cam_from_object=pose))
 
     def _on_info(self, message: Any) -> None:
+        self._camera = None  # of images that follow one that cannot be used, no older camera is true
         self._camera = camera_of_info(message, self._rectified)
 
     def _on_image(self, message: Any) -> None:
         camera = self._camera
         if camera is None:
-            self._throttle.warning("images without a CameraInfo are left out")
+            self._throttle.warning("images without a CameraInfo that can be used are left out")
             return
         pixels, encoding = image_of(message)
+        size, told = size_of(pixels, encoding), (camera.width, camera.height)
+        if size != told:
+            read = "cannot be read" if size is None else "is {}x{}".format(*size)
+            raise SourceError(f"an image {read}, its CameraInfo is of {told[0]}x{told[1]}")
         header = first_header(self._images, stamp_ns(message) or time.time_ns())
         for topic, sent in frame_messages(header, pixels, encoding, camera, CameraOrigin.CALIBRATED):
             self._frames.publish(topic, sent)
@@ -175,6 +184,12 @@ class NextFrame:
     def seen(self, number: int) -> None:
         step = 1 if self._newest is None else number - self._newest
         self._newest, self.next = number, number + max(step, 1)
+
+
+def _latency_ms(state: State, received_ns: int) -> float | None:
+    """Since the capture; None where stamps are by another clock, as a simulation's or a bag's that is played."""
+    since_ns = received_ns - state.header.capture_ns
+    return since_ns / 1e6 if 0 <= since_ns < _LATEST_NS else None
 
 
 def _differs(before: State | None, now: State | None) -> bool:

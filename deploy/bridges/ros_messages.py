@@ -1,7 +1,7 @@
 """From what tracking believes to the messages of ROS 2, and back from a pose of ROS to a guess; no input or output.
 
-ROS has the pose of the camera in the object's frame, in metres, and its covariance in the order x y z and rotation
-about x y z, of small changes along and about the fixed axes of the object's frame (REP 103).
+ROS has the pose of a frame in its parent, in metres, and its covariance in the order x y z and rotation about x y z, of
+small changes along and about the fixed axes of the parent (REP 103).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from fieldpose.bus.messages import State, TrackingState
 from fieldpose.bus.ros2 import NO_HASH, RosTopic
 from fieldpose.errors import ConfigError, GeometryError
 from fieldpose.stages.geometry import RIGID_TOLERANCE, adjoint, inverse, is_rigid
-from fieldpose.stages.geometry.rigid import from_rotation
+from fieldpose.stages.geometry.rigid import from_rotation, skew
 
 Distro = Literal["humble", "jazzy", "kilted", "lyrical"]
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -26,6 +26,7 @@ DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 BODY_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """From OpenCV's axes (x right, y down, z forward) to those of a body (x forward, y left, z up); REP 103."""
 _UNKNOWN_VARIANCE = 1e6
+_STAMPS_NS = 2**31 * 10**9
 _LEVELS = {
     TrackingState.TRACKING: 0,
     TrackingState.LIMITED: 1,
@@ -39,8 +40,11 @@ _STALE = 3
 class Frames:
     """Names of frames, and where the camera is mounted. Raises ConfigError for names that tf2 refuses."""
 
+    of: Literal["camera", "object"] = "camera"
+    """Whose pose is published: the camera's (or the base's) in the object's frame, as of a robot in a map; or the
+    object's in the camera's (or the base's), as of a part to be grasped, where the camera has a parent already."""
     map: str = "object"
-    """The object's frame, in which poses are."""
+    """The object's frame."""
     camera: str = "camera_optical_frame"
     """The camera's, in OpenCV's axes: x right, y down, z forward."""
     base: str | None = None
@@ -62,6 +66,15 @@ class Frames:
     @property
     def child(self) -> str:
         """The frame whose pose is published."""
+        return self._body if self.of == "camera" else self.map
+
+    @property
+    def parent(self) -> str:
+        """The frame that it is in."""
+        return self.map if self.of == "camera" else self._body
+
+    @property
+    def _body(self) -> str:
         return self.base or self.camera
 
     def base_from_camera(self) -> np.ndarray:
@@ -76,8 +89,8 @@ class Frames:
 
 
 def is_published(state: State) -> bool:
-    """Whether a state is published as a pose: tracking is sure of it, and of how sure it is."""
-    return state.is_sure and state.covariance is not None
+    """Whether a state is published as a pose: tracking is sure of it, and of how sure it is, at a time that ROS has."""
+    return state.is_sure and state.covariance is not None and state.header.capture_ns < _STAMPS_NS
 
 
 def pose_in_ros(
@@ -98,11 +111,28 @@ def pose_in_ros(
     return object_from_base, moved @ covariance @ moved.T
 
 
-def cam_from_object_of(object_from_base: np.ndarray, base_from_camera: np.ndarray, metres: float) -> np.ndarray:
-    """The camera's pose (4, 4) in field units, of a body's in metres."""
-    object_from_cam = object_from_base @ base_from_camera
-    object_from_cam[:3, 3] /= metres
-    return inverse(object_from_cam)
+def object_in_ros(
+    cam_from_object: np.ndarray, covariance: np.ndarray, base_from_camera: np.ndarray, metres: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """base_from_object (4, 4) in metres, and the covariance (6, 6) of its position and rotation about fixed axes.
+
+    covariance, metres: see pose_in_ros. A left twist turns about the base's origin, and so moves what is away from it.
+    """
+    scale = np.diag([metres, metres, metres, 1.0, 1.0, 1.0])
+    in_metres = cam_from_object.copy()
+    in_metres[:3, 3] *= metres
+    base_from_object = base_from_camera @ in_metres
+    lever = np.eye(6)
+    lever[:3, 3:] = -skew(base_from_object[:3, 3])
+    moved = lever @ adjoint(base_from_camera) @ scale
+    return base_from_object, moved @ covariance @ moved.T
+
+
+def cam_from_object_of(base_from_object: np.ndarray, base_from_camera: np.ndarray, metres: float) -> np.ndarray:
+    """The camera's pose (4, 4) in field units, of where a body has the object in metres."""
+    cam_from_object = inverse(base_from_camera) @ base_from_object
+    cam_from_object[:3, 3] /= metres
+    return cam_from_object
 
 
 class RosMessages:
@@ -154,11 +184,12 @@ class RosMessages:
         )  # fmt: skip
 
     def tf(self, state: State) -> bytes:
-        """TFMessage of a sure state: map to camera, or map to base and, where no mount is given, base to camera."""
-        object_from_base, _ = self._in_ros(state)
-        transforms = [self._transform(state, self.frames.map, self.frames.child, object_from_base)]
-        if self.frames.base is not None and self.frames.mount is None:
-            transforms.append(self._transform(state, self.frames.base, self.frames.camera, self._base_from_camera))
+        """TFMessage of a sure state: parent to child, and base to camera where the base is the camera's own body."""
+        parent_from_child, _ = self._in_ros(state)
+        frames = self.frames
+        transforms = [self._transform(state, frames.parent, frames.child, parent_from_child)]
+        if frames.of == "camera" and frames.base is not None and frames.mount is None:
+            transforms.append(self._transform(state, frames.base, frames.camera, self._base_from_camera))
         return self._encoded(self._new(TF, transforms=transforms))
 
     def diagnostics(self, pipeline: str, now_ns: int, state: State | None, latency_ms: float | None) -> bytes:
@@ -185,21 +216,21 @@ class RosMessages:
     def guess(self, message: Any) -> np.ndarray:
         """cam_from_object (4, 4) of a PoseWithCovarianceStamped of the frame that poses are published of.
 
-        Raises GeometryError for numbers that are no pose, and for a pose in another frame than the object's.
+        Raises GeometryError for numbers that are no pose, and for a pose in another frame than those are in.
         """
         from scipy.spatial.transform import Rotation
 
         named = message.header.frame_id
-        if named != self.frames.map:
-            raise GeometryError(f"a guess in frame {named!r}, but poses are in {self.frames.map!r}; see --frames.map")
+        if named != self.frames.parent:
+            raise GeometryError(f"a guess in frame {named!r}, but poses are in {self.frames.parent!r}; see --frames")
         pose = message.pose.pose
         turned = np.array([pose.orientation.x, pose.orientation.y, pose.orientation.z, pose.orientation.w])
         if not abs(np.linalg.norm(turned) - 1.0) < RIGID_TOLERANCE:
             raise GeometryError(f"a guess has the quaternion {turned.tolist()}, whose length is not 1")
         place = (pose.position.x, pose.position.y, pose.position.z)
-        found = cam_from_object_of(
-            from_rotation(Rotation.from_quat(turned), place), self._base_from_camera, self._metres
-        )
+        given = from_rotation(Rotation.from_quat(turned), place)
+        base_from_object = inverse(given) if self.frames.of == "camera" else given
+        found = cam_from_object_of(base_from_object, self._base_from_camera, self._metres)
         if not is_rigid(found, RIGID_TOLERANCE):
             raise GeometryError(f"a guess has the position {list(place)}, which is none")
         return found
@@ -207,14 +238,15 @@ class RosMessages:
     def _in_ros(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         if state.cam_from_object is None or state.covariance is None:
             raise ValueError("a state without a pose or its covariance is not published")
-        return pose_in_ros(state.cam_from_object, state.covariance, self._base_from_camera, self._metres)
+        made = pose_in_ros if self.frames.of == "camera" else object_in_ros
+        return made(state.cam_from_object, state.covariance, self._base_from_camera, self._metres)
 
     def _pose(self, state: State) -> Any:
-        object_from_base, covariance = self._in_ros(state)
-        x, y, z = object_from_base[:3, 3].tolist()
+        parent_from_child, covariance = self._in_ros(state)
+        x, y, z = parent_from_child[:3, 3].tolist()
         pose = self._new(
             "geometry_msgs/msg/Pose", position=self._new("geometry_msgs/msg/Point", x=x, y=y, z=z),
-            orientation=self._quaternion(object_from_base),
+            orientation=self._quaternion(parent_from_child),
         )  # fmt: skip
         return self._new("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance.ravel())
 
@@ -234,7 +266,7 @@ class RosMessages:
         return self._new("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
     def _header(self, state: State) -> Any:
-        return self._stamped(state.header.capture_ns, self.frames.map)
+        return self._stamped(state.header.capture_ns, self.frames.parent)
 
     def _stamped(self, at_ns: int, frame: str) -> Any:
         stamp = self._new("builtin_interfaces/msg/Time", sec=at_ns // 10**9, nanosec=at_ns % 10**9)

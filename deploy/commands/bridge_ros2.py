@@ -28,7 +28,8 @@ class Ros2:
     Example: fieldpose bridge ros2 --connect tcp/127.0.0.1:41234 --router tcp/127.0.0.1:7447
 
     Poses that tracking is sure of are published as PoseWithCovarianceStamped, Odometry and transforms, of the camera
-    (or --frames.base) in the object's frame, and how tracking is as diagnostics. A pipeline's hub and the router of ROS
+    (or --frames.base) in the object's frame, or with --frames.of object the other way round, and how tracking is as
+    diagnostics. A pipeline's hub and the router of ROS
     are two: both listen on port 7447 where nobody says otherwise, so each is to be named. See docs/ros2.md.
     """
 
@@ -73,7 +74,7 @@ class Ros2:
                 try:
                     bridge = RosBridge(bus, self.address, node, names, self.topics, messages)
                     said = topics_in_words(bridge.published) or "nothing"
-                    print(f"publishes {said}; a unit of the field is {metres:g} m", flush=True)
+                    print(f"publishes {said}; {self.unit_in_words()}", flush=True)
                     if bridge.taken:
                         print(f"takes {topics_in_words(bridge.taken)}", flush=True)
                     bridge.run(signals.stop)
@@ -82,6 +83,12 @@ class Ros2:
             finally:
                 bus.close()
         return 0
+
+    def unit_in_words(self) -> str:
+        """How long the field's unit is taken to be."""
+        if self.metres is None and self.field is None:
+            return "WITHOUT A KNOWN SCALE, the field's unit is taken for 1 m: give --field or --metres"
+        return f"a unit of the field is {self.metres_of_unit():g} m"
 
     def metres_of_unit(self) -> float:
         """Length of the field's unit. Raises ConfigError where the field does not know it, and FieldFileError."""

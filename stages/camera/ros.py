@@ -16,6 +16,7 @@ from fieldpose.bus.messages import Encoding
 from fieldpose.errors import SourceError
 from fieldpose.stages.camera.camera_files import camera_of
 from fieldpose.stages.geometry import Camera
+from fieldpose.stages.images import encoded_size
 
 IMAGE, COMPRESSED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 """Types by the names that ROS 2 has for them."""
@@ -53,6 +54,11 @@ def image_of(message: Any) -> tuple[np.ndarray, Encoding]:
     encodings that are not supported, by their name, and for data that is not what it says.
     """
     return (_pixels(message), "rgb8") if hasattr(message, "encoding") else _compressed(message)
+
+
+def size_of(pixels: np.ndarray, encoding: Encoding) -> tuple[int, int] | None:
+    """Width and height of what image_of gives; None for a file that cannot be read."""
+    return encoded_size(pixels) if encoding != "rgb8" else (pixels.shape[1], pixels.shape[0])
 
 
 def camera_of_info(message: Any, rectified: bool) -> Camera | None:

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from fieldpose.bus.protocol import Closer
 from fieldpose.bus.ros2 import RosNames, RosTopic, attachment, gid_of
 from fieldpose.bus.topics import FRAME, PRIOR, STATE, Address
 from fieldpose.bus.transport import ZenohBus, serve_hub
-from fieldpose.deploy.bridges.ros2 import NextFrame
+from fieldpose.deploy.bridges.ros2 import NextFrame, RosBridge, RosTopics, _latency_ms
 from fieldpose.deploy.bridges.ros_messages import (
     BODY_FROM_OPTICAL,
     DIAGNOSTICS,
@@ -46,6 +47,7 @@ from fieldpose.deploy.bridges.ros_messages import (
     Frames,
     RosMessages,
     is_published,
+    object_in_ros,
     pose_in_ros,
 )
 from fieldpose.deploy.cli import main, parse
@@ -66,6 +68,8 @@ HASHES = {
 WAIT_S = 20.0
 CAM_FROM_OBJECT = on_sphere(30, 40)
 MOUNT = (0.3, -0.1, 0.5, 0.1, -0.2, 1.2)
+FAR = (6.0, -4.0, 9.0, 0.1, -0.2, 1.2)
+"""A camera ten metres from the base, which its rotation moves more than its translation does."""
 
 
 def covariance(scale: float = 1.0) -> np.ndarray:
@@ -93,28 +97,32 @@ def matrix(place: Any, turned: Any) -> np.ndarray:
     return result
 
 
+@pytest.fixture(scope="module")
+def drawn() -> np.ndarray:
+    """(n, 4, 4): exponentials of twists that were drawn."""
+    twists = np.random.default_rng(1).multivariate_normal(np.zeros(6), covariance(), 20_000)
+    return np.stack([exp_se3(twist) for twist in twists])
+
+
 @pytest.mark.parametrize("metres", [1.0, 0.25])
-@pytest.mark.parametrize(
-    "frames",
-    [Frames(), Frames(base="base_link"), Frames(base="base_link", mount=MOUNT)],
-    ids=["camera", "base", "mount"],
-)
-def test_the_covariance_is_that_of_poses_drawn_by_their_twist(frames: Frames, metres: float) -> None:
-    base_from_camera = frames.base_from_camera()
-    sent = covariance()
-    pose, stated = pose_in_ros(CAM_FROM_OBJECT, sent, base_from_camera, metres)
-    twists = np.random.default_rng(1).multivariate_normal(np.zeros(6), sent, 20_000)
-    drawn = []
-    for twist in twists:
-        object_from_cam = inverse(exp_se3(twist) @ CAM_FROM_OBJECT)
-        object_from_cam[:3, 3] *= metres
-        object_from_base = object_from_cam @ inverse(base_from_camera)
-        turned = Rotation.from_matrix(object_from_base[:3, :3] @ pose[:3, :3].T).as_rotvec()
-        drawn.append([*(object_from_base[:3, 3] - pose[:3, 3]), *turned])
-    found = np.cov(np.array(drawn).T)
+@pytest.mark.parametrize("of", ["camera", "object"])
+@pytest.mark.parametrize("mounted", [{}, {"base": "b"}, {"base": "b", "mount": MOUNT}, {"base": "b", "mount": FAR}])
+def test_the_covariance_is_that_of_poses_drawn_by_their_twist(
+    drawn: np.ndarray, of: Any, mounted: dict[str, Any], metres: float
+) -> None:
+    base_from_camera = Frames(of=of, **mounted).base_from_camera()
+    sent, made = covariance(), pose_in_ros if of == "camera" else object_in_ros
+    cam_from_object = exp_se3([1.5, -0.8, 0.4, 0.2, 0.5, -0.3]) @ CAM_FROM_OBJECT
+    pose, stated = made(cam_from_object, sent, base_from_camera, metres)
+    base_from_object = drawn @ cam_from_object
+    base_from_object[:, :3, 3] *= metres
+    base_from_object = base_from_camera @ base_from_object
+    found = np.linalg.inv(base_from_object) if of == "camera" else base_from_object
+    turned = Rotation.from_matrix(found[:, :3, :3] @ pose[:3, :3].T).as_rotvec()
+    seen = np.cov(np.hstack([found[:, :3, 3] - pose[:3, 3], turned]).T)
     spread = np.sqrt(np.diag(stated))
-    np.testing.assert_allclose(np.sqrt(np.diag(found)), spread, rtol=0.03)
-    np.testing.assert_allclose(found / np.outer(spread, spread), stated / np.outer(spread, spread), atol=0.03)
+    np.testing.assert_allclose(np.sqrt(np.diag(seen)), spread, rtol=0.03)
+    np.testing.assert_allclose(seen / np.outer(spread, spread), stated / np.outer(spread, spread), atol=0.03)
 
 
 def test_a_pose_is_the_camera_in_the_objects_frame() -> None:
@@ -164,6 +172,27 @@ def test_transforms_lead_to_the_camera_by_way_of_its_body() -> None:
     np.testing.assert_allclose(found[:3, 3], 0.5 * inverse(CAM_FROM_OBJECT)[:3, 3], atol=1e-12)
 
 
+def test_an_object_is_published_below_the_camera_of_a_robot() -> None:
+    frames = Frames(of="object", map="part")
+    message = read(RosMessages(frames, 0.5).pose(state()), POSE)
+    assert message.header.frame_id == "camera_optical_frame"
+    in_metres = CAM_FROM_OBJECT.copy()
+    in_metres[:3, 3] *= 0.5
+    pose = message.pose.pose
+    np.testing.assert_allclose(matrix(pose.position, pose.orientation), in_metres, atol=1e-12)
+    stated = object_in_ros(CAM_FROM_OBJECT, covariance(), np.eye(4), 0.5)[1]
+    np.testing.assert_allclose(message.pose.covariance.reshape(6, 6), stated, rtol=1e-12)
+    odometry = read(RosMessages(frames).odometry(state()), ODOMETRY)
+    assert (odometry.header.frame_id, odometry.child_frame_id) == ("camera_optical_frame", "part")
+    for mount in (None, MOUNT):
+        # The robot's own description tells where its camera is.
+        robot = Frames(of="object", base="base_link", mount=mount)
+        (only,) = read(RosMessages(robot).tf(state()), TF).transforms
+        assert (only.header.frame_id, only.child_frame_id) == ("base_link", "object")
+        found = matrix(only.transform.translation, only.transform.rotation)
+        np.testing.assert_allclose(found, robot.base_from_camera() @ CAM_FROM_OBJECT, atol=1e-12)
+
+
 def test_a_mount_is_read_as_urdf_has_it() -> None:
     yawed = Frames(base="b", mount=(1.0, 2.0, 3.0, 0.0, 0.0, np.pi / 2)).base_from_camera()
     # A camera that looks to the left of the robot: its z is the robot's y.
@@ -195,18 +224,23 @@ def test_diagnostics_without_a_state_are_stale() -> None:
 
 
 def test_only_what_tracking_is_sure_of_is_a_pose() -> None:
+    late = state()
+    late.header = first_header(7, 2**31 * 10**9)  # ROS' stamps end there
     assert is_published(state())
     assert not is_published(state(score=0.0))
     assert not is_published(state(covariance=None))
+    assert not is_published(late)
     assert not any(is_published(state(kind)) for kind in TrackingState if kind is not TrackingState.TRACKING)
 
 
-@pytest.mark.parametrize("frames", [Frames(), Frames(base="base_link", mount=MOUNT)])
+@pytest.mark.parametrize(
+    "frames", [Frames(), Frames(base="base_link", mount=MOUNT), Frames(of="object", base="base_link", mount=MOUNT)]
+)
 def test_a_pose_that_comes_back_is_the_cameras(frames: Frames) -> None:
     messages = RosMessages(frames, 0.5)
     found = messages.guess(messages.decoded(messages.pose(state()), POSE))
     np.testing.assert_allclose(found, CAM_FROM_OBJECT, atol=1e-12)
-    with pytest.raises(GeometryError, match="a guess in frame 'object', but poses are in 'map'"):
+    with pytest.raises(GeometryError, match=f"a guess in frame '{frames.parent}', but poses are in 'map'"):
         RosMessages(Frames(map="map")).guess(messages.decoded(messages.pose(state()), POSE))
     zero = messages.decoded(messages.pose(state()), POSE)
     zero.pose.pose.orientation.x = zero.pose.pose.orientation.w = 0.0
@@ -311,9 +345,15 @@ def test_the_length_of_a_unit_is_the_fields_own(tmp_path: Path) -> None:
         arguments = ["ros2", "--connect", "a", "--router", "b", *(str(option) for option in options)]
         return float(parse(bridge.Options, "bridge", arguments).to.metres_of_unit())
 
+    def unit(*options: object) -> str:
+        arguments = ["ros2", "--connect", "a", "--router", "b", *map(str, options)]
+        return str(parse(bridge.Options, "bridge", arguments).to.unit_in_words())
+
     assert metres("--field", demo_file("field.safetensors")) == 0.1
     assert metres("--field", demo_file("field.safetensors"), "--metres", 2) == 2.0
     assert metres() == 1.0
+    assert "WITHOUT A KNOWN SCALE" in unit()
+    assert unit("--metres", 2) == "a unit of the field is 2 m"
     unknown = save_empty_field(tmp_path / "field.safetensors")
     with pytest.raises(ConfigError, match="how long that is in metres is not known; give --metres"):
         metres("--field", unknown)
@@ -509,6 +549,52 @@ def camera_info() -> Any:
     return types["sensor_msgs/msg/CameraInfo"](
         header(), 6, 8, "plumb_bob", np.zeros(5), k, np.eye(3).ravel(), np.zeros(12), 0, 0, region
     )
+
+
+class _Nowhere:
+    """A bus and a node of ROS without any wire: keeps what is put on the bus, and the sinks of subscriptions."""
+
+    def __init__(self) -> None:
+        self.put_on: list[str] = []
+        self.sinks: dict[str, Any] = {}
+
+    def put(self, key: str, payload: bytes, topic: Any) -> None:
+        self.put_on.append(topic.name)
+
+    def publisher(self, topic: RosTopic) -> Callable[[bytes], None]:
+        return lambda payload: None
+
+    def subscribe(self, topic: RosTopic, sink: Any, capacity: int) -> None:
+        self.sinks[topic.name] = sink
+
+
+def test_no_image_goes_with_a_camera_that_is_not_its_own(capfd: pytest.CaptureFixture[str]) -> None:
+    wires: Any = _Nowhere()
+    RosBridge(wires, Address(), wires, RosNames(), RosTopics(image="/front/image_raw"), RosMessages(Frames()))
+
+    def heard(topic: str, message: Any) -> list[str]:
+        wires.put_on.clear()
+        wires.sinks[f"/front/{topic}"](topic, bytes(STORE.serialize_cdr(message, message.__msgtype__)), 0)
+        return list(wires.put_on)
+
+    def images() -> list[str]:
+        return heard("image_raw", bgr_image(np.zeros((6, 8, 3), np.uint8)))
+
+    assert images() == []
+    heard("camera_info", camera_info())
+    assert images() == ["frame", "camera_info"]
+    assert heard("image_raw", bgr_image(np.zeros((3, 4, 3), np.uint8))) == []
+    assert "an image is 4x3, its CameraInfo is of 8x6" in capfd.readouterr().err
+    heard("camera_info", replace(camera_info(), distortion_model="equidistant"))
+    assert images() == []
+    heard("camera_info", camera_info())
+    assert images() == ["frame", "camera_info"]
+
+
+def test_latency_is_told_where_stamps_are_by_this_clock() -> None:
+    assert _latency_ms(state(), CAPTURE_NS + 25_000_000) == 25.0
+    assert _latency_ms(state(), CAPTURE_NS - 1) is None
+    assert _latency_ms(state(), 3 * CAPTURE_NS) is None
 
 
 def test_a_bridge_of_plain_keys_sends_cdr_under_the_topics_names() -> None:

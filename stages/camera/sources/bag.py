@@ -25,10 +25,11 @@ from fieldpose.stages.camera.ros import (
     image_of,
     info_topic,
     is_rectified,
+    size_of,
     stamp_ns,
 )
 from fieldpose.stages.geometry import Camera
-from fieldpose.stages.images import decoded, encoded_size, shrunk_with_camera
+from fieldpose.stages.images import decoded, shrunk_with_camera
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -141,7 +142,7 @@ class _Bag:
             pixels, encoding = image_of(message.image)
         except SourceError as error:
             raise SourceError(f"{self.path}: image {number} on {self.topic}: {error}") from error
-        size = encoded_size(pixels) if encoding != "rgb8" else (pixels.shape[1], pixels.shape[0])
+        size = size_of(pixels, encoding)
         if size is None:
             raise self._unreadable(number)
         if told is None:

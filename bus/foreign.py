@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from fieldpose.errors import OutputError
+
+_OWN_PROFILE = "fieldpose"
 
 
 class ForeignWriter:
     """Writes PATH under a temporary name and gives it its own at the end; nothing is left where that was not reached.
 
-    Use it in a `with` statement. Raises OutputError where nothing can be written.
+    Use it in a `with` statement. Raises OutputError where nothing can be written, and where PATH is a recording of this
+    project, since that is not made anew as easily as what is written here.
     """
 
     def __init__(self, path: Path) -> None:
@@ -41,6 +47,8 @@ class ForeignWriter:
         self._writer.add_metadata(name, dict(values))
 
     def __enter__(self) -> ForeignWriter:
+        if _is_recording(self._path):
+            raise OutputError(f"{self._path}: is a recording, which would be overwritten; name another file")
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._stream = open(self._partial, "wb")
@@ -70,3 +78,11 @@ class ForeignWriter:
 
     def _failure(self, error: OSError) -> OutputError:
         return OutputError(f"{self._path}: cannot be written: {error.strerror}")
+
+
+def _is_recording(path: Path) -> bool:
+    try:
+        with path.open("rb") as stream:
+            return make_reader(stream).get_header().profile == _OWN_PROFILE
+    except (OSError, ValueError, EOFError, struct.error, McapError):
+        return False

@@ -13,7 +13,7 @@ from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address
 from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
 from fieldpose.deploy.foxglove.extra import check_extra
-from fieldpose.deploy.foxglove.layouts import LAYOUT
+from fieldpose.deploy.foxglove.layouts import layout
 from fieldpose.deploy.processes.endpoints import peer_address
 from fieldpose.deploy.reporting.output import check_writable, write_bytes
 from fieldpose.errors import UsageError
@@ -42,7 +42,8 @@ class Foxglove:
     port: int = 8765
     """The port to listen on; 0 for a free one."""
     layout: Path | None = None
-    """Write the layout that shows everything into this file (.json), to be imported in Foxglove."""
+    """Write the layout that shows everything into this file (.json), to be imported in Foxglove. What it draws has the
+    right size for cameras about 4 units away; the layout that `fieldpose export` writes fits its recording."""
     address: Annotated[Address, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Address)
     """Which pipeline."""
 
@@ -74,7 +75,7 @@ class Foxglove:
         check_writable(self.layout)
 
     def _write_layout(self, path: Path) -> None:
-        write_bytes(path, LAYOUT.read_bytes())
+        write_bytes(path, layout())
         print(f"{path}: a layout")
 
 

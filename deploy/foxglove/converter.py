@@ -40,6 +40,7 @@ from fieldpose.stages.geometry import Camera, Similarity
 _FRAMES_KEPT = 1000
 _PATH_POSES, _PATH_NS = 600, 1_000_000_000
 _RATE_STATES = 31
+_SAME_CLOCK_NS = 60_000_000_000
 _COLOURS = {
     TrackingState.TRACKING: drawing.GREEN,
     TrackingState.LIMITED: drawing.ORANGE,
@@ -68,11 +69,15 @@ class Converter:
     """Converts the messages of one pipeline, in the order of their receipt.
 
     wanted: asked of each message before it is made. object_from_dataset: into the frame that poses are in, for true
-    poses, which are in that of the dataset; without it these are left out.
+    poses, which are in that of the dataset; without it these are left out. behind_ns: see clock_behind_ns, of the first
+    frame.
     """
 
     def __init__(
-        self, wanted: Callable[[Channel], bool] = lambda channel: True, object_from_dataset: Similarity | None = None
+        self,
+        wanted: Callable[[Channel], bool] = lambda channel: True,
+        object_from_dataset: Similarity | None = None,
+        behind_ns: int = 0,
     ) -> None:
         self._wanted = wanted
         self._object_from_dataset = object_from_dataset
@@ -83,6 +88,7 @@ class Converter:
         self._path_ns: int | None = None
         self._believed: tuple[Any, Any] | None = None
         self._lost = 0
+        self._behind_ns = behind_ns
 
     def convert(self, topic: Topic[Any], message: Message) -> Iterator[Converted]:
         """What a message becomes: any number of messages, none where there is nothing to see.
@@ -94,11 +100,16 @@ class Converter:
             self._gathering.note_header(topic, header)
         if not isinstance(message, Truth) or self._object_from_dataset is not None:
             self._gathering.note(message)
-        for channel, make in self._offers(message, header.capture_ns):
+        at = header.capture_ns
+        if isinstance(message, Frame | CameraInfo):
+            self._behind_ns = clock_behind_ns(header)
+        elif isinstance(message, Stats | Control):
+            at = max(at - self._behind_ns, 0)
+        for channel, make in self._offers(message, at):
             if self._wanted(channel):
                 made = make()
                 payload = msgspec.json.encode(made) if isinstance(made, msgspec.Struct) else made.encode()
-                yield Converted(channel, payload, header.capture_ns, header.sent_ns, header.sequence)
+                yield Converted(channel, payload, at, header.sent_ns, header.sequence)
 
     def _offers(self, message: Message, at: int) -> Iterator[tuple[Channel, Callable[[], Any]]]:
         match message:
@@ -194,6 +205,15 @@ class Converter:
     def _rate_hz(self) -> float | None:
         span_s = (self._states[-1] - self._states[0]) / 1e9
         return (len(self._states) - 1) / span_s if span_s > 0 else None
+
+
+def clock_behind_ns(header: Header) -> int:
+    """How far a frame's clock is behind this computer's, where it is another: a simulation's, or that of a ROS bag.
+
+    What is of no frame has this computer's time, and is to be beside the frames.
+    """
+    behind_ns = header.sent_ns - header.capture_ns
+    return behind_ns if abs(behind_ns) > _SAME_CLOCK_NS else 0
 
 
 def _matched(pixels: np.ndarray) -> tuple[str, np.ndarray, drawing.Colour]:

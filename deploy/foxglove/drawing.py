@@ -31,6 +31,8 @@ GREEN, RED, BLUE, ORANGE, GREY = (
 )  # fmt: skip
 
 _NS = 1_000_000_000
+_STAMPS_NS = 2**32 * _NS
+_LARGEST_JPEG = 65_500
 _CORNER = 0.5
 _POINT_PX, _FONT_PX = 4.0, 14.0
 _CLOUD = (
@@ -41,7 +43,9 @@ _NUMERIC = {"<f4": Numeric.Float32, "u1": Numeric.Uint8}
 
 
 def stamp(at_ns: int) -> messages.Timestamp:
-    """A time since the epoch."""
+    """A time since the epoch. Raises OutputError for one that Foxglove's messages cannot hold."""
+    if at_ns >= _STAMPS_NS:
+        raise OutputError(f"a time of {at_ns} ns since the epoch is later than Foxglove's messages can say")
     return messages.Timestamp(sec=at_ns // _NS, nsec=at_ns % _NS)
 
 
@@ -87,9 +91,9 @@ def image(pixels: np.ndarray, encoding: Encoding, frame: str, at_ns: int) -> mes
     """pixels: (h, w, 3) uint8 RGB, which become a JPEG, or the bytes (n,) of a file, which stay. Raises OutputError."""
     content, kind = pixels, encoding
     if encoding == "rgb8":
-        written, content = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
-        if not written:
+        if not 0 < min(pixels.shape) <= max(pixels.shape) <= _LARGEST_JPEG:
             raise OutputError(f"an image of {pixels.shape[1]}x{pixels.shape[0]} pixels cannot be written as a JPEG")
+        _, content = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
         kind = "jpeg"
     return messages.CompressedImage(timestamp=stamp(at_ns), frame_id=frame, data=content.tobytes(), format=kind)
 

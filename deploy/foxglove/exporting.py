@@ -9,9 +9,9 @@ from pathlib import Path
 
 from fieldpose.bus.foreign import ForeignWriter
 from fieldpose.bus.replay import read_recording
-from fieldpose.bus.topics import Address
+from fieldpose.bus.topics import CAMERA_INFO, FRAME, Address
 from fieldpose.deploy.foxglove.channels import ALL
-from fieldpose.deploy.foxglove.converter import Converted, Converter
+from fieldpose.deploy.foxglove.converter import Converted, Converter, clock_behind_ns
 from fieldpose.deploy.reporting.trajectories import in_words
 from fieldpose.stages.nerf.metadata import FieldMetadata
 
@@ -22,10 +22,12 @@ _LATEST_NS = 5_000_000_000
 def export(recording: Path, out: Path, address: Address, field: FieldMetadata | None) -> dict[str, int]:
     """Write one pipeline of a recording; returns topic -> number of messages, of all topics.
 
-    Messages have their frame's capture time as log time, and the time of their being sent as publish time. True poses
-    are written where the field is known. Raises RecordingError and OutputError.
+    Messages have their frame's capture time as log time, and the time of their being sent as publish time; what is of
+    no frame has its own time, by the frames' clock. True poses are written where the field is known. Raises
+    RecordingError and OutputError.
     """
-    converter = Converter(object_from_dataset=None if field is None else field.frame.object_from_dataset)
+    moved = None if field is None else field.frame.object_from_dataset
+    converter = Converter(object_from_dataset=moved, behind_ns=_behind_ns(recording, address))
     counts: Counter[str] = Counter({channel.topic: 0 for channel in ALL})
     with ForeignWriter(out) as writer:
         for channel in ALL:
@@ -38,6 +40,12 @@ def export(recording: Path, out: Path, address: Address, field: FieldMetadata | 
         about = {"recording": recording.name, "object": address.object, "camera": address.camera}
         writer.add(_RECORD, {**about, "lengths": in_words(field)})
     return dict(counts)
+
+
+def _behind_ns(recording: Path, address: Address) -> int:
+    told = (one for one in read_recording(recording, (CAMERA_INFO, FRAME)) if address.covers(one.key))
+    first = next(told, None)
+    return 0 if first is None else clock_behind_ns(first.message.header)
 
 
 def in_order(messages: Iterable[Converted]) -> Iterator[Converted]:

@@ -21,6 +21,8 @@ from fieldpose.errors import OutputError, TransportError
 PICTURES_HZ = 10.0
 _POLL_S = 0.1
 _FRAMES = 8
+_WAITING = 128
+"""Messages kept for a client that does not read: the SDK's own 1024 are a gigabyte of depth images."""
 
 
 class Server:
@@ -35,7 +37,9 @@ class Server:
         self._context = foxglove.Context()  # the server and the channels do not keep it
         self._channels = {channel: _served(channel, self._context) for channel in channels.ALL}
         try:
-            self._server = foxglove.start_server(name=name, host=host, port=port, context=self._context)
+            self._server = foxglove.start_server(
+                name=name, host=host, port=port, context=self._context, message_backlog_size=_WAITING
+            )
         except (RuntimeError, OverflowError) as error:
             why = str(error).removeprefix("FoxgloveError: ")
             raise TransportError(f"cannot serve on {host}:{port}: {why}; choose others with --host, --port") from error

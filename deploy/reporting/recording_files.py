@@ -12,7 +12,7 @@ from typing import Literal
 from fieldpose.bus.replay import info
 from fieldpose.bus.topics import Address
 from fieldpose.deploy.foxglove.extra import check_extra
-from fieldpose.deploy.foxglove.layouts import LAYOUT
+from fieldpose.deploy.foxglove.layouts import layout, recorded_distance
 from fieldpose.deploy.reporting.gathering import recorded_pipeline, recorded_results
 from fieldpose.deploy.reporting.output import check_writable, progress_bar, write_bytes
 from fieldpose.deploy.reporting.provenance import pipelines_in, recorded_field
@@ -50,7 +50,9 @@ class RecordingFiles:
     def write(self) -> Iterator[str]:
         """Write them; gives a line about each. Raises RecordingError and OutputError."""
         if self.layout is not None:
-            write_bytes(self.layout, LAYOUT.read_bytes())
+            one = self.foxglove is not None or self.pipeline is not None
+            address = recorded_pipeline(self.recording, self.pipeline) if one else None
+            write_bytes(self.layout, layout(recorded_distance(self.recording, address)))
             yield f"{self.layout}: a layout, to be imported in Foxglove or Lichtblick"
         if self.foxglove is not None:
             yield self._foxglove(self.foxglove)

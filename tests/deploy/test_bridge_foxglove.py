@@ -23,7 +23,8 @@ from fieldpose.bus.topics import CORRESPONDENCES, FRAME, STATE, Address
 from fieldpose.bus.transport import ZenohBus, serve_hub
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.foxglove import channels
-from fieldpose.deploy.foxglove.serving import PICTURES_HZ, Bridge, Server
+from fieldpose.deploy.foxglove.converter import Converted
+from fieldpose.deploy.foxglove.serving import _WAITING, PICTURES_HZ, Bridge, Server
 from fieldpose.deploy.processes.endpoints import free_port
 from fieldpose.deploy.scene import demo_file
 from fieldpose.errors import TransportError
@@ -109,6 +110,37 @@ def test_pictures_are_wanted_only_by_who_looks_and_ten_times_a_second() -> None:
             assert not server.wanted(channels.IMAGE)
             now[0] += 0.6 / PICTURES_HZ
             assert server.wanted(channels.IMAGE)
+
+
+def test_of_what_waits_for_a_client_that_does_not_read_the_newest_is_kept() -> None:
+    image = bytes(1 << 18)
+    with Server("127.0.0.1", 0, "test") as server, client_of(server.port) as client:
+        client.subscribe("/view/depth")
+        until_wanted(server, channels.VIEW_DEPTH)
+        for number in range(3 * _WAITING):
+            server.send(Converted(channels.VIEW_DEPTH, image, number, number, number))
+        # In the raw, for these bytes are no message.
+        times = []
+        while not times or times[-1] < 3 * _WAITING - 1:
+            said = client.socket.recv(ENOUGH_S)
+            if isinstance(said, bytes):
+                times.append(int.from_bytes(said[5:13], "little"))
+    assert times == sorted(times)
+    assert times[-_WAITING:] == list(range(2 * _WAITING, 3 * _WAITING))
+    assert len(times) < 2 * _WAITING
+
+
+def test_a_client_that_leaves_and_another_that_stays() -> None:
+    with Server("127.0.0.1", 0, "test") as server, client_of(server.port) as stays:
+        with client_of(server.port) as leaves:
+            for client in (leaves, stays):
+                client.subscribe("/state")
+            until_wanted(server, channels.STATE)
+        payload = b"{}"
+        for number in range(5):
+            server.send(Converted(channels.STATE, payload, number, number, number))
+        got = [log_ns for _, (_, _, log_ns) in zip(range(5), stays.messages(ENOUGH_S), strict=False)]
+    assert got == [0, 1, 2, 3, 4]
 
 
 def test_a_port_in_use_is_told() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping
+from copy import copy
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,12 +24,13 @@ from fieldpose.bus.recording import RecordingWriter
 from fieldpose.bus.replay import read_recording
 from fieldpose.bus.topics import Address, Topic
 from fieldpose.deploy.cli import main
-from fieldpose.deploy.foxglove import channels
+from fieldpose.deploy.foxglove import channels, drawing
 from fieldpose.deploy.foxglove.converter import Converted, Converter
 from fieldpose.deploy.foxglove.exporting import in_order
-from fieldpose.deploy.foxglove.layouts import LAYOUT
+from fieldpose.deploy.foxglove.layouts import layout, recorded_distance
 from fieldpose.deploy.scene import demo_file
-from fieldpose.stages.geometry import Similarity, camera_centre, inverse, rotation_about
+from fieldpose.errors import OutputError
+from fieldpose.stages.geometry import Similarity, camera_centre, inverse, look_at, rotation_about
 
 ADDRESS = Address("fieldpose", "mug", "cam")
 S = 10**9
@@ -324,6 +326,51 @@ def test_messages_are_in_the_order_of_their_frames() -> None:
     assert list(in_order(iter([]))) == []
 
 
+def test_what_is_of_no_frame_is_beside_the_frames_whose_clock_is_another(tmp_path: Path) -> None:
+    """Frames of a ROS bag that is played have the times of its recording, processes those of this computer."""
+    now, played = 1_700_000_000 * S, 1_500_000_000 * S
+
+    def sent(message: Message, at: int, captured: int) -> Message:
+        message.header = Header("a", 0, 1, 0, captured, at)
+        return message
+
+    recording, stats = tmp_path / "a.mcap", bus_samples.every_message()[topics.STATS]
+    writer = RecordingWriter(recording)
+    for topic, message in (
+        (topics.STATS, sent(stats, now - 2 * S, now - 2 * S)),
+        (topics.FRAME, sent(bus_samples.frame(1), now, played)),
+        (topics.STATS, sent(copy(stats), now + S, now + S)),
+        (topics.STATE, sent(state(1, TrackingState.LOST), now + S, played)),
+    ):
+        writer.write(ADDRESS.key(topic, "a"), topic, message, message.header.sent_ns)
+    writer.close()
+    read = exported(recording)
+    assert [one.log_ns for one in read["/stats"]] == [played - 2 * S, played + S]
+    assert [one.publish_ns for one in read["/stats"]] == [now - 2 * S, now + S]
+    assert [one.log_ns for one in read["/camera/image"]] == [played]
+
+
+def test_what_foxglove_cannot_hold_is_an_error_of_output() -> None:
+    late = state(1, TrackingState.TRACKING, pose=viewpoint())
+    late.header = first_header(1, 2**32 * S)
+    with pytest.raises(OutputError, match="is later than Foxglove's messages can say"):
+        list(Converter().convert(topics.STATE, late))
+    with pytest.raises(OutputError, match="an image of 70000x1 pixels cannot be written as a JPEG"):
+        drawing.image(np.zeros((1, 70_000, 3), np.uint8), "rgb8", "camera", 0)
+
+
+def test_a_recording_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first, other = (
+        record(tmp_path / name, [(topics.STATE, state(1, TrackingState.LOST))]) for name in ("a.mcap", "b.mcap")
+    )
+    before = other.read_bytes()
+    assert main(["export", str(first), "--foxglove", str(other)]) == 2
+    assert "b.mcap: is a recording, which would be overwritten; name another file" in capsys.readouterr().err
+    assert other.read_bytes() == before
+    for _ in range(2):  # what was exported before is replaced
+        assert main(["export", str(first), "--foxglove", str(tmp_path / "c.mcap")]) == 0
+
+
 def test_only_what_is_wanted_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = []
 
@@ -360,12 +407,12 @@ def test_frames_alone_are_exported_too(tmp_path: Path) -> None:
 def test_the_layout_shows_what_is_written(tmp_path: Path) -> None:
     recording = record(tmp_path / "a.mcap", list(bus_samples.every_message().items()))
     exported(recording, "--layout", tmp_path / "a.json")
-    layout = json.loads((tmp_path / "a.json").read_text())
-    assert (tmp_path / "a.json").read_bytes() == LAYOUT.read_bytes()
-    panels = set(_leaves(layout["layout"]))
-    assert panels == layout["configById"].keys()
+    shown = json.loads((tmp_path / "a.json").read_text())
+    assert (tmp_path / "a.json").read_bytes() == layout(recorded_distance(recording, ADDRESS))
+    panels = set(_leaves(shown["layout"]))
+    assert panels == shown["configById"].keys()
     known = {channel.topic: channel for channel in channels.ALL}
-    named = [text for text in _texts(layout["configById"]) if text.startswith("/")]
+    named = [text for text in _texts(shown["configById"]) if text.startswith("/")]
     assert named
     for text in named:
         topic, *path = text.split(".")
@@ -374,6 +421,41 @@ def test_the_layout_shows_what_is_written(tmp_path: Path) -> None:
             schema = json.loads(known[topic].schema[2])
             for part in path:
                 schema = schema["properties"][part]
+
+
+def test_the_layout_has_the_lengths_of_what_was_recorded(tmp_path: Path) -> None:
+    def lifted(scale: float) -> Message:
+        points = np.random.default_rng(0).normal(scale=0.1, size=(20, 3)).astype(np.float32) * scale
+        pose = look_at(np.array([0.0, -4.0, 0.0]) * scale, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        same = {"confidence": np.ones(20, np.float32), "consistency": np.zeros(20, np.float32)}
+        return Correspondences(
+            header=first_header(1, S), view_cam_from_object=pose, pixels_in_frame=np.zeros((20, 2), np.float32),
+            points_in_object=points, kept=np.ones(20, bool), **same,
+        )  # fmt: skip
+
+    made = {}
+    for scale in (1.0, 250.0):
+        recording = record(tmp_path / f"{scale}.mcap", [(topics.CORRESPONDENCES, lifted(scale))])
+        assert main(["export", str(recording), "--layout", str(tmp_path / "a.json")]) == 0
+        made[scale] = json.loads((tmp_path / "a.json").read_text())["configById"]
+    near, far = made[1.0]["3D!scene"], made[250.0]["3D!scene"]
+    assert far["cameraState"]["distance"] == pytest.approx(1000.0, rel=0.02)
+    for where in (
+        ("cameraState", "distance"), ("cameraState", "far"), ("layers", "grid", "size"),
+        ("topics", "/pose", "axisScale"), ("topics", "/pose/unsure", "arrowScale", 0), ("topics", "/path", "lineWidth"),
+        ("topics", "/camera/calibration", "distance"),
+    ):  # fmt: skip
+        assert _at(far, where) == pytest.approx(250 * _at(near, where), rel=1e-4), where
+    assert (far["cameraState"]["fovy"], far["layers"]["grid"]["lineWidth"]) == (45, 1)
+    assert made[250.0]["Image!depth"]["imageMode"]["maxValue"] == pytest.approx(1500.0, rel=0.02)
+    without = record(tmp_path / "b.mcap", [(topics.STATE, state(1, TrackingState.LOST))])
+    assert recorded_distance(without, None) == 4.0
+
+
+def _at(tree: Any, where: tuple[str | int, ...]) -> Any:
+    for key in where:
+        tree = tree[key]
+    return tree
 
 
 def _leaves(tree: Any) -> list[str]:

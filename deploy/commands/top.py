@@ -5,15 +5,18 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
-from rich.console import Group
+from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.live import Live
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
+from fieldpose.bus.messages import State
 from fieldpose.bus.ports import Inbox
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address
@@ -30,6 +33,12 @@ _CAPACITY = 4096
 _COLUMNS = (
     "process", "", "msgs/s", "busy ms p50", "p90", "CPU %", "MB", "gaps", "skipped", "refused", "failed", "restarts",
 )  # fmt: skip
+_TRACKING = "tracking"
+_NARROW = {"busy ms p50": "p50 ms", "skipped": "skip", "restarts": "restart"}
+"""Headings where there is little room."""
+_LEFT_OUT_FIRST = ("p90", "skipped", "MB")
+_ANY_WIDTH = 10_000
+_GONE_COLOURS = {"silent": "red", "ended": "dim"}
 _COLOURS = {"starting": "yellow", "ready": "", "ended": "dim", "silent": "red"}
 _STATE_COLOURS = {"tracking": "green", "limited": "yellow", "lost": "red", "initializing": "yellow"}
 
@@ -97,43 +106,85 @@ def _live(inbox: Inbox, signals: StopSignals) -> None:
 
 
 def shown(rows: list[Row], headings: list[Heading]) -> Group:
-    """A table of each pipeline below a line of how tracking is."""
+    """A table of each pipeline below a line of how tracking is; tables fit the width of what they are printed on."""
     addresses = dict.fromkeys(row.address for row in rows)
     tracking = {heading.address: heading for heading in headings}
-    parts: list[Text | Table] = []
+    parts: list[Text | _Processes] = []
     for address in addresses:
-        parts.append(_heading(address, tracking.get(address), named=len(addresses) > 1))
-        parts.append(_table([row for row in rows if row.address == address]))
+        own = [row for row in rows if row.address == address]
+        parts.append(_heading(address, tracking.get(address), own, named=len(addresses) > 1))
+        parts.append(_Processes(own))
     return Group(*parts)
 
 
-def _heading(address: Address, heading: Heading | None, named: bool) -> Text:
+def _heading(address: Address, heading: Heading | None, rows: list[Row], named: bool) -> Text:
     text = Text(f"{address.pair}: " if named else "")
     if heading is None:
         return text.append("tracking has said nothing yet")
     state = heading.state
+    gone = next((row for row in rows if row.name == _TRACKING and row.condition in ("silent", "ended")), None)
+    if gone is not None:
+        how = "has ended" if gone.condition == "ended" else f"is {_condition(gone)}"
+        text.append(f"tracking {how}, what it said last: ", _GONE_COLOURS[gone.condition])
+        return text.append(f"{state.state}, score {state.score:.2f}, {_doorkeeping(state)}", "dim")
     text.append(str(state.state), _STATE_COLOURS[state.state])
     latency = "-" if heading.latency_ms is None else "{:.0f}, {:.0f}".format(*heading.latency_ms)
     words = [f"score {state.score:.2f}", f"{heading.rate_hz:.1f} frames/s", f"latency p50, p90: {latency} ms"]
-    words.append(f"{state.dropped_at_the_door} dropped, {state.lost} lost, {state.in_flight} in flight")
+    words.append(_doorkeeping(state))
     if state.level:
         words.append(f"level {state.level}")
     return text.append(f", {', '.join(words)}")
 
 
-def _table(rows: list[Row]) -> Table:
-    table = Table()
-    for place, heading in enumerate(_COLUMNS):
-        table.add_column(heading, justify="left" if place < 2 else "right", no_wrap=place < 2)
+def _doorkeeping(state: State) -> str:
+    return f"{state.dropped_at_the_door} dropped, {state.lost} lost, {state.in_flight} in flight"
+
+
+@dataclass(frozen=True)
+class _Processes:
+    """A pipeline's processes: as a table with lines, or where that is too wide as one without, and with less in it."""
+
+    rows: list[Row]
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        table = _table(self.rows, narrow=False)
+        unbounded = options.update(width=_ANY_WIDTH)
+        for left_out in range(len(_LEFT_OUT_FIRST) + 1):
+            if Measurement.get(console, unbounded, table).maximum <= options.max_width:
+                break
+            table = _table(self.rows, narrow=True, without=_LEFT_OUT_FIRST[:left_out])
+        yield table
+
+
+def _table(rows: list[Row], narrow: bool, without: Sequence[str] = ()) -> Table:
+    table = Table(box=None, padding=(0, 1, 0, 0)) if narrow else Table()
+    kept = [place for place, heading in enumerate(_COLUMNS) if heading not in without]
+    for place in kept:
+        heading = _NARROW.get(_COLUMNS[place], _COLUMNS[place]) if narrow else _COLUMNS[place]
+        table.add_column(heading, justify="left" if place < 2 else "right", no_wrap=True)
     for row in rows:
-        stats = row.stats
-        counts = (stats.gaps, stats.skipped, stats.refused, stats.failed, row.restarts)
-        table.add_row(
-            row.name, _condition(row), _number(row.published_per_s), f"{stats.busy_ms_p50:.1f}",
-            f"{stats.busy_ms_p90:.1f}", _number(None if row.cpu is None else 100 * row.cpu, 0), f"{stats.rss_mb:.0f}",
-            *map(str, counts), style=_COLOURS[row.condition],
-        )  # fmt: skip
+        cells = _cells(row, _in_short if narrow else str)
+        table.add_row(*(cells[place] for place in kept), style=_COLOURS[row.condition])
     return table
+
+
+def _cells(row: Row, written: Callable[[int], str]) -> list[str]:
+    stats = row.stats
+    counts = (stats.gaps, stats.skipped, stats.refused, stats.failed, row.restarts)
+    return [
+        row.name, _condition(row), _number(row.published_per_s), _number(stats.busy_ms_p50),
+        _number(stats.busy_ms_p90), _number(None if row.cpu is None else 100 * row.cpu, 0), f"{stats.rss_mb:.0f}",
+        *map(written, counts),
+    ]  # fmt: skip
+
+
+def _in_short(count: int) -> str:
+    """A count in at most four characters up to a thousand million: 12345 is 12k."""
+    for unit in ("", "k", "M"):
+        if count < (10_000 if not unit else 1000):
+            return f"{count}{unit}"
+        count //= 1000
+    return f"{count}G"
 
 
 def _condition(row: Row) -> str:

@@ -155,6 +155,54 @@ def test_the_table_has_a_line_of_each_process_and_silent_ones_are_red() -> None:
     assert "tracking has said nothing yet" in captured.get()
 
 
+def many(address: Address = HERE) -> Standing:
+    """Every stage, with numbers as after days."""
+    standing = Standing(0)
+    for name in STAGES:
+        for said in (stats(name, 0, 1.0, address=address), stats(name, 1, 2.0, 1200, 1.5, address=address)):
+            message = said.message
+            assert isinstance(message, Stats)
+            message.gaps, message.skipped, message.refused, message.failed = 9_999, 123_456, 7_654_321, 10_000
+            message.busy_ms_p50, message.rss_mb = 1234.5, 23456.0
+            standing.note([said])
+    return standing
+
+
+def printed(standing: Standing, at_s: float, width: int) -> list[str]:
+    console = Console(width=width)
+    with console.capture() as captured:
+        console.print(shown(standing.rows(round(at_s * SECOND_NS)), standing.headings(round(at_s * SECOND_NS))))
+    return captured.get().splitlines()
+
+
+@pytest.mark.parametrize("at_s", [2.1, 9.0])
+def test_in_a_narrow_terminal_no_number_is_cut(at_s: float) -> None:
+    lines = printed(many(), at_s, 80)
+    assert max(map(len, lines)) <= 80
+    assert not any("…" in line for line in lines)
+    (line,) = (line for line in lines if line.startswith("matching"))
+    rate = ["1200.0"] if at_s < 3 else ["silent", "7", "s", "-"]
+    assert line.split()[1 : len(rate) + 1] == rate
+    assert {"1234.5", "23456", "9999", "7M", "10k"} <= set(line.split())
+    assert {"MB", "gaps", "refused", "failed", "restart"} <= set(lines[1].split())
+    narrower = printed(many(), 2.1, 65)
+    assert max(map(len, narrower)) <= 65
+    assert not any("…" in line for line in narrower)
+    assert "failed" in narrower[1]
+    (line,) = (line for line in printed(many(), at_s, 200) if line.startswith("│ matching"))
+    assert "123456" in line
+
+
+@pytest.mark.parametrize(("ready", "said"), [(True, "is silent 7 s"), (False, "has ended")])
+def test_a_state_of_tracking_that_is_gone_is_no_state_of_now(ready: bool, said: str) -> None:
+    standing = Standing(0)
+    standing.note([stats("tracking", 0, 1.0), stats("tracking", 1, 2.0, ready=ready), state(0, 2.0)])
+    assert printed(standing, 2.1, 140)[0].startswith("tracking, score 0.90, ") == ready
+    assert printed(standing, 9.0, 140)[0] == (
+        f"tracking {said}, what it said last: tracking, score 0.90, 7 dropped, 2 lost, 1 in flight"
+    )
+
+
 def test_where_no_hub_is(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("fieldpose.deploy.commands.top._HUB_S", 0.2)
     hub = f"tcp/127.0.0.1:{free_port()}"

@@ -152,4 +152,8 @@ def _compressed(message: Any) -> tuple[np.ndarray, Encoding]:
 
 def _converted(image: np.ndarray, code: int | None) -> np.ndarray:
     pixels = (image >> 8).astype(np.uint8) if image.dtype.itemsize == 2 else image
-    return pixels if code is None else np.asarray(cv2.cvtColor(pixels, code))
+    try:
+        return pixels if code is None else np.asarray(cv2.cvtColor(pixels, code))
+    except cv2.error as error:  # pixels of an odd number whose colours are told in pairs
+        height, width = image.shape[:2]
+        raise SourceError(f"an image of {width}x{height} pixels cannot be of its encoding ({error.err})") from error

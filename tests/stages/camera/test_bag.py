@@ -221,6 +221,7 @@ def test_compressed_images_stay_as_they_are(tmp_path: Path, kind: str, suffix: s
             image(picture()[..., :1].astype(np.uint16), "16UC1"),
             "encoding '16UC1' is not supported; expected bayer_bggr16",
         ),
+        (image(picture()[:, :7, :2], "yuv422"), "an image of 7x6 pixels cannot be of its encoding (sz.width % 2 == 0)"),
         (image(picture()[..., :2], "nv21"), "encoding 'nv21' is not supported"),
         (replace(image(picture()), step=5), "has 144 bytes in rows of 5; expected at least 6 rows of 24"),
         (replace(image(picture()), data=np.zeros(100, np.uint8)), "has 100 bytes in rows of 24"),

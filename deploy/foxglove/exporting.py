@@ -17,6 +17,7 @@ from fieldpose.stages.nerf.metadata import FieldMetadata
 
 _RECORD = "fieldpose"
 _LATEST_NS = 5_000_000_000
+_ROOM = 512 << 20
 
 
 def export(recording: Path, out: Path, address: Address, field: FieldMetadata | None) -> dict[str, int]:
@@ -48,16 +49,19 @@ def _behind_ns(recording: Path, address: Address) -> int:
     return 0 if first is None else clock_behind_ns(first.message.header)
 
 
-def in_order(messages: Iterable[Converted]) -> Iterator[Converted]:
+def in_order(messages: Iterable[Converted], room: int = _ROOM) -> Iterator[Converted]:
     """Messages by their log times, as readers of long files like them.
 
-    What is told of a frame comes after newer frames; where that is more than _LATEST_NS, the order stays wrong.
+    What is told of a frame comes after newer frames; where that is more than _LATEST_NS, or more than `room` bytes
+    would have to wait, as of a clock that stands still, the order stays wrong.
     """
     waiting: list[tuple[int, int, Converted]] = []
-    newest = 0
+    newest = held = 0
     for number, message in enumerate(messages):
         heapq.heappush(waiting, (message.log_ns, number, message))
-        newest = max(newest, message.log_ns)
-        while waiting[0][0] < newest - _LATEST_NS:
-            yield heapq.heappop(waiting)[-1]
+        newest, held = max(newest, message.log_ns), held + len(message.payload)
+        while waiting and (waiting[0][0] < newest - _LATEST_NS or held > room):
+            oldest = heapq.heappop(waiting)[-1]
+            held -= len(oldest.payload)
+            yield oldest
     yield from (message for _, _, message in sorted(waiting))

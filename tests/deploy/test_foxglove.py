@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from copy import copy
 from pathlib import Path
 from typing import Any, cast
@@ -324,6 +324,20 @@ def test_messages_are_in_the_order_of_their_frames() -> None:
     assert [message.log_ns // S for message in ordered] == [1, 2, 2, 2, 3, 4, 3, 0, 9, 10, 11]
     assert [message.sequence for message in ordered[1:4]] == [1, 3, 4]
     assert list(in_order(iter([]))) == []
+
+
+def test_what_waits_for_its_turn_is_bounded() -> None:
+    """A clock that stands still, so that nothing is ever late enough."""
+    taken = 0
+
+    def standing() -> Iterator[Converted]:
+        nonlocal taken
+        for taken in range(100):
+            yield Converted(channels.STATE, bytes(10), S, 0, taken)
+
+    ordered = in_order(standing(), room=50)
+    assert (next(ordered).sequence, taken) == (0, 5)
+    assert [message.sequence for message in ordered] == list(range(1, 100))
 
 
 def test_what_is_of_no_frame_is_beside_the_frames_whose_clock_is_another(tmp_path: Path) -> None:

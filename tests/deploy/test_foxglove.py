@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from copy import copy
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, cast
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
+from foxglove import layouts
+from foxglove import messages as shown
 from support import bus_samples
 from support.analytic_scene import viewpoint
 from support.foxglove import CLOUD, Read, groups, read_mcap, rigid, when
@@ -421,12 +426,12 @@ def test_frames_alone_are_exported_too(tmp_path: Path) -> None:
 def test_the_layout_shows_what_is_written(tmp_path: Path) -> None:
     recording = record(tmp_path / "a.mcap", list(bus_samples.every_message().items()))
     exported(recording, "--layout", tmp_path / "a.json")
-    shown = json.loads((tmp_path / "a.json").read_text())
+    written = json.loads((tmp_path / "a.json").read_text())
     assert (tmp_path / "a.json").read_bytes() == layout(recorded_distance(recording, ADDRESS))
-    panels = set(_leaves(shown["layout"]))
-    assert panels == shown["configById"].keys()
+    panels = set(_leaves(written["layout"]))
+    assert panels == written["configById"].keys()
     known = {channel.topic: channel for channel in channels.ALL}
-    named = [text for text in _texts(shown["configById"]) if text.startswith("/")]
+    named = [text for text in _texts(written["configById"]) if text.startswith("/")]
     assert named
     for text in named:
         topic, *path = text.split(".")
@@ -464,6 +469,65 @@ def test_the_layout_has_the_lengths_of_what_was_recorded(tmp_path: Path) -> None
     assert made[250.0]["Image!depth"]["imageMode"]["maxValue"] == pytest.approx(1500.0, rel=0.02)
     without = record(tmp_path / "b.mcap", [(topics.STATE, state(1, TrackingState.LOST))])
     assert recorded_distance(without, None) == 4.0
+
+
+_PANELS: dict[str, type[Any]] = {
+    "Plot": layouts.PlotConfig, "RosOut": layouts.LogConfig, "RawMessages": layouts.RawMessagesConfig,
+}  # fmt: skip
+_SHOWN_BY: dict[type[Any], type[Any]] = {
+    shown.PoseInFrame: layouts.BaseRendererPoseTopicSettings,
+    shown.PosesInFrame: layouts.BaseRendererPosesTopicSettings,
+    shown.PointCloud: layouts.BaseRendererPointCloudTopicSettings,
+    shown.CameraCalibration: layouts.BaseRendererCameraTopicSettings,
+}
+_TITLES = {"foxglovePanelTitle", "lichtblickPanelTitle"}
+_SHARED = {"cameraState", "followMode", "followTf", "imageMode", "topics", "layers"}
+"""Settings that are checked by themselves, or that Foxglove's image and 3D panels have in common in files."""
+
+
+def test_the_layouts_settings_are_those_that_foxglove_describes() -> None:
+    """In its SDK, which has a type for each panel."""
+    kinds = {channel.topic: channel.kind for channel in channels.ALL}
+    for name, config in json.loads(layout())["configById"].items():
+        panel = name.partition("!")[0]
+        own = {key: value for key, value in config.items() if key not in _TITLES}
+        if panel in _PANELS:
+            _check_described(own, _PANELS[panel])
+            continue
+        if panel == "StateTransitions":
+            _check_known(own, layouts.StateTransitionsConfig)
+            for series in own["paths"]:
+                _check_known(series, layouts.StateTransitionsSeries)
+            continue
+        kind = layouts.ThreeDeeConfig if panel == "3D" else layouts.ImageConfig
+        _check_known({key: value for key, value in own.items() if key not in _SHARED}, kind)
+        _check_described(own["cameraState"], layouts.ThreeDeeCameraState)
+        _check_described(own["imageMode"], layouts.ImageModeConfig)
+        for topic, settings in own["topics"].items():
+            _check_described(settings, _SHOWN_BY[kinds[topic]])
+        for grid in own["layers"].values():
+            _check_described(grid, layouts.BaseRendererGridLayerSettings, {"layerId"})
+
+
+def _check_described(settings: Mapping[str, Any], kind: type[Any], fixed: Collection[str] = ()) -> None:
+    """Whether nothing is lost or refused where the settings are read as that type."""
+    given = {key: value for key, value in settings.items() if key not in fixed}
+    read = json.loads(msgspec.convert(_snake_keys(given), kind, strict=False).to_json())
+    assert {key: read.get(key) for key in settings} == settings, kind
+
+
+def _check_known(settings: Mapping[str, Any], kind: type[Any]) -> None:
+    assert {_snake(key) for key in settings} <= {field.name for field in fields(kind)}
+
+
+def _snake_keys(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {_snake(key): _snake_keys(inner) for key, inner in value.items()}
+    return [_snake_keys(inner) for inner in value] if isinstance(value, list) else value
+
+
+def _snake(key: str) -> str:
+    return re.sub("[A-Z]", lambda letter: f"_{letter[0].lower()}", key)
 
 
 def _at(tree: Any, where: tuple[str | int, ...]) -> Any:

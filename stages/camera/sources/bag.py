@@ -200,6 +200,8 @@ def _named(rest: str, config: CameraConfig, calibrator: Calibrator) -> _Bag:
         raise SourceError(f"{path}: no such bag")
     if path.suffix == ".zstd":
         raise SourceError(f"{path}: a part of a bag, compressed as a whole; give the folder of the bag")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        raise SourceError(f"{path}: has no metadata.yaml, as folders of ROS 2's bags have; of ROS 1 give the .bag file")
     if not path.is_dir() and path.suffix not in _KINDS:
         raise SourceError(f"{path}: expected a bag of ROS 1 (.bag) or of ROS 2 (.mcap, .db3 or its folder)")
     with _opened(path) as reader:
@@ -237,4 +239,5 @@ def _opened(path: Path) -> Iterator[AnyReader]:
             yield reader
     except (AnyReaderError, Ros1Error, Ros2Error, apsw.Error, *_DAMAGE) as error:
         detail = " ".join(str(error).split()) or type(error).__name__
-        raise SourceError(f"{path}: cannot be read as a bag ({detail})") from error
+        hint = "; recordings of fieldpose itself are read as mcap:FILE" if "Profile is not" in detail else ""
+        raise SourceError(f"{path}: cannot be read as a bag ({detail}){hint}") from error

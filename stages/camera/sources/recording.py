@@ -47,7 +47,9 @@ def _refuse_others(path: str) -> None:
     except RecordingError as error:
         raise SourceError(str(error)) from error
     if held is not None:
-        raise SourceError(f"{path}: is {held}; --source bag:{path} reads the images of ROS' bags")
+        bag = held.startswith("a recording of ros")
+        hint = f"--source bag:{path} reads the images of ROS' bags" if bag else "give the recording of fieldpose itself"
+        raise SourceError(f"{path}: is {held}; {hint}")
 
 
 def _address(recorded: str) -> Address:

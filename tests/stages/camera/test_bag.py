@@ -18,7 +18,9 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
 
+from fieldpose.bus.foreign import ForeignWriter
 from fieldpose.bus.messages import CameraOrigin
+from fieldpose.bus.recording import RecordingWriter
 from fieldpose.errors import SourceError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame
@@ -371,7 +373,7 @@ def test_what_is_no_bag_is_refused_in_one_line(tmp_path: Path) -> None:
         ("text.bag", "cannot be read as a bag"),
         ("text.db3", "cannot be read as a bag"),
         ("text.mcap", "cannot be read as a bag"),
-        ("empty", "cannot be read as a bag"),
+        ("empty", "has no metadata.yaml, as folders of ROS 2's bags have"),
     ):
         with pytest.raises(SourceError) as raised:
             frames_of(tmp_path / name)
@@ -385,6 +387,12 @@ def test_what_is_no_bag_is_refused_in_one_line(tmp_path: Path) -> None:
         SourceError, match=r"no images in this bag, which holds /front/camera_info \(sensor_msgs/msg/Cam"
     ):
         frames_of(path)
+
+
+def test_a_recording_of_ones_own_is_no_bag(tmp_path: Path) -> None:
+    RecordingWriter(tmp_path / "a.mcap").close()
+    with pytest.raises(SourceError, match="recordings of fieldpose itself are read as mcap:FILE"):
+        frames_of(tmp_path / "a.mcap")
 
 
 def test_a_bag_that_ends_early_is_refused_in_one_line(tmp_path: Path) -> None:
@@ -401,6 +409,18 @@ def test_mcap_says_of_a_bag_of_ros_what_it_holds(tmp_path: Path) -> None:
     assert str(raised.value) == (
         f"{path}: is a recording of ros2, with {RAW} (sensor_msgs/msg/Image); --source bag:{path} reads the images of"
         " ROS' bags"
+    )
+
+
+def test_mcap_says_of_an_export_that_it_is_none_of_ones_own(tmp_path: Path) -> None:
+    with ForeignWriter(tmp_path / "a.mcap") as writer:
+        writer.channel("/camera/image", "json", ("foxglove.CompressedImage", "jsonschema", b"{}"))
+        writer.write("/camera/image", b"{}", 1, 1, 0)
+    with pytest.raises(SourceError) as raised:
+        open_source(CameraConfig(f"mcap:{tmp_path / 'a.mcap'}"))
+    assert str(raised.value) == (
+        f"{tmp_path / 'a.mcap'}: is a recording of another program, with /camera/image (foxglove.CompressedImage); give"
+        " the recording of fieldpose itself"
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -46,13 +46,17 @@ class Said:
 
 
 class LocalPipeline:
-    """The handlers of a plan, but for the camera unless asked for, started. Raises what they raise at start."""
+    """The handlers of a plan, but for the camera unless asked for, started. Raises what they raise at start.
 
-    def __init__(self, parts: Parts, with_camera: bool = False) -> None:
+    only: of these processes alone.
+    """
+
+    def __init__(self, parts: Parts, with_camera: bool = False, only: Container[str] | None = None) -> None:
         left_out = {HUB, RECORDER} if with_camera else {HUB, RECORDER, CAMERA}
         rows = [row for row in rows_of(parts.plan, recorded=False) if row.name not in left_out]
-        self._handlers: list[Handler] = [row.make(parts, Launch()) for row in rows if row.make is not None]
-        for handler in self._handlers:
+        rows = [row for row in rows if only is None or row.name in only]
+        self.handlers: list[Handler] = [row.make(parts, Launch()) for row in rows if row.make is not None]
+        for handler in self.handlers:
             handler.start()
 
     def send(self, *outputs: Output) -> Iterator[Said]:
@@ -61,7 +65,7 @@ class LocalPipeline:
         while waiting:
             said = waiting.popleft()
             yield said
-            for handler in self._handlers:
+            for handler in self.handlers:
                 if said.topic in handler.inputs:
                     waiting.extend(_timed(handler.name, handler.handle(said.topic, said.message)))
 
@@ -69,7 +73,7 @@ class LocalPipeline:
         """Let the camera send its source to the end, and give all that is said."""
         try:
             while True:
-                for handler in self._handlers:
+                for handler in self.handlers:
                     for topic, message in handler.tick(time.time_ns()):
                         yield from self.send((topic, message))
         except EndOfInput:
@@ -77,7 +81,7 @@ class LocalPipeline:
 
     def close(self) -> None:
         """Let go of what the handlers hold."""
-        for handler in self._handlers:
+        for handler in self.handlers:
             handler.stop()
 
 

@@ -133,7 +133,7 @@ class Parts:
         config, following = self.settings.tracking, self.settings.following
         if self.plan.follows:
             policy = make_followed_policy(config, following, self.training_views, self.plan.looks)
-            return FollowingTracker(config, following, policy)
+            return FollowingTracker(config, following, policy, patient=self.settings.camera.pace == "lockstep")
         return Tracker(config, make_policy(config, self.training_views, self.plan.looks))
 
     @cached_property

@@ -123,7 +123,7 @@ def _camera(config: CameraConfig, notes: dict[str, str]) -> CameraConfig:
 def _follows(
     config: FollowingConfig, sequence: Sequence, begins: Beginning, camera: CameraConfig, notes: dict[str, str]
 ) -> bool:
-    """Following answers at once, so that a source that waits for answers would leave no time for solving."""
+    """Following is for time that is short; a source that waits for answers has each frame solved, unless asked."""
     if sequence == "photos" or begins.by_frame:
         why = "photos" if sequence == "photos" else "each frame has a guess of its own"
         if config.when == "always":

@@ -16,10 +16,13 @@ from fieldpose.bus.replay import Attachment, RecordingInfo, read_attachment
 from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.settings import Settings, changed, to_json, without_unknown
 from fieldpose.errors import RecordingError
+from fieldpose.stages.cores import usable_cores
 
+CORES = "cores"
 RUN_RECORD, PLAN_RECORD, EDIT_RECORD = "fieldpose.run", "fieldpose.plan", "fieldpose.edit"
 SETTINGS_ATTACHMENT = "settings.json"
 FIELD_ATTACHMENT = "field.safetensors"
+MOST_CORES = 1024
 _PACKAGES = ("fieldpose", "numpy", "torch", "kornia", "numba", "opencv-python-headless", "eclipse-zenoh")
 
 
@@ -62,6 +65,15 @@ def recorded_settings(path: Path, pipeline: str | None = None) -> Settings:
     return changed(Settings(), content, f"{path}: {name}")
 
 
+def recorded_cores(recording: RecordingInfo, pipeline: str | None = None) -> int | None:
+    """How many cores the recorded run could use, from which its numbers of threads follow; None where it is not said.
+
+    pipeline: OBJECT/CAMERA, where the recording holds several.
+    """
+    said = recording.metadata.get(RUN_RECORD if pipeline is None else f"{RUN_RECORD} {pipeline}", {}).get(CORES, "")
+    return int(said) if said.isdecimal() and 0 < int(said) <= MOST_CORES else None
+
+
 def recorded_field(path: Path, recording: RecordingInfo, folder: Path, pipeline: str | None = None) -> Path:
     """The field of a recorded run: its own file where that is still the same, else a copy put into `folder`.
 
@@ -89,6 +101,7 @@ def made_with(plan: Plan) -> dict[str, str]:
         "matcher": settings.matching.matcher,
         "python": platform.python_version(),
         "machine": f"{platform.system()} {platform.machine()}",
+        CORES: str(usable_cores()),
     }
     if field is not None:
         values |= {"field": str(field), "field_sha256": sha256_of(field)}

@@ -18,9 +18,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from fieldpose.bus.messages import CameraModel, Frame, Header, Truth
+from fieldpose.bus.messages import Frame, Header, Truth
 from fieldpose.bus.recorder import RecordingWriter
 from fieldpose.bus.topics import FRAME, TRUTH, Address
+from fieldpose.stages.geometry import Camera
 
 SOURCE = "camera"
 STARTED_NS = 1_750_000_000_000_000_000
@@ -33,8 +34,8 @@ def cam_from_object(frame: dict[str, Any]) -> np.ndarray:
     return np.ascontiguousarray(OPENCV_FROM_OPENGL @ np.linalg.inv(world_from_cam))
 
 
-def camera_model(poses: dict[str, Any]) -> CameraModel:
-    return CameraModel(poses["w"], poses["h"], poses["fl_x"], poses["fl_y"], poses["cx"], poses["cy"])
+def camera_model(poses: dict[str, Any]) -> Camera:
+    return Camera(poses["w"], poses["h"], poses["fl_x"], poses["fl_y"], poses["cx"], poses["cy"])
 
 
 def jpeg(path: Path, quality: int) -> np.ndarray:

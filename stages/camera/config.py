@@ -33,8 +33,12 @@ class CameraConfig:
     auto: live for what has times of its own, lockstep for photos."""
     rate_hz: float | None = None
     """Frames a second instead of the source's own times."""
+    speed: float = 1.0
+    """live: so many times as fast as the source's own times say."""
     every: int = 1
     """Send only every so many-th frame, at its own time."""
+    first: int = 0
+    """Leave out so many frames at the beginning."""
     frames: int | None = None
     """Stop after so many."""
     objects: tuple[str, ...] = ()
@@ -50,9 +54,11 @@ class CameraConfig:
     """Notes which frame comes next, so that a camera that is started again goes on there."""
 
     def __post_init__(self) -> None:
-        for name in ("size", "rate_hz", "every", "frames", "answer_timeout_s"):
+        for name in ("size", "rate_hz", "speed", "every", "frames", "answer_timeout_s"):
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ConfigError(f"camera: {name} is {value}, but must be more than 0")
+        if self.first < 0:
+            raise ConfigError(f"camera: first is {self.first}, but must not be less than 0")
         if not 1.0 <= self.fov_deg <= 170.0:
             raise ConfigError(f"camera: fov_deg is {self.fov_deg}, but must lie between 1 and 170 degrees")

@@ -55,6 +55,14 @@ class Source:
     frames: Callable[[int], Iterator[CapturedFrame]]
     length: int | None = None
 
+    def check(self, config: CameraConfig) -> None:
+        """Raise ConfigError for what is asked of its frames and cannot be."""
+        if self.clock == "wall" and (config.first or config.speed != 1.0):
+            raise ConfigError("camera: a device has no frames to leave out, and one speed; leave out first and speed")
+        pace = self.pace(config.pace)
+        if pace != "live" and config.speed != 1.0:
+            raise ConfigError(f"camera: speed {config.speed:g} is for pace live, and this pace is {pace}")
+
     def pace(self, wanted: Pace) -> Pace:
         """The pace to send at. ConfigError for a device that is to wait."""
         if self.clock == "wall" and wanted == "lockstep":
@@ -68,12 +76,13 @@ class Feed:
     """Gives each frame when it is due, and knows when all have been answered; `first` were sent before."""
 
     def __init__(self, source: Source, config: CameraConfig, first: int = 0) -> None:
+        source.check(config)
         self._pace = source.pace(config.pace)
         self._clock = source.clock
-        self._rate_hz = config.rate_hz
+        self._rate_hz, self._speed = config.rate_hz, config.speed
         self._timeout_ns = int(config.answer_timeout_s * 1e9)
         self._left = None if config.frames is None else config.frames - first
-        self._frames = source.frames(first * config.every)
+        self._frames = source.frames(config.first + first * config.every)
         self._sent_ones = islice(self._frames, 0, None, config.every)
         self._next: CapturedFrame | None = None
         self._exhausted = False
@@ -160,7 +169,8 @@ class Feed:
             return now_ns
         at_ns = frame.at_ns if rate_hz is None else round(self._sent * 1e9 / rate_hz)
         self._start = self._start or (now_ns, at_ns or 0)
-        return self._start[0] + (at_ns or 0) - self._start[1]
+        since_ns = (at_ns or 0) - self._start[1]
+        return self._start[0] + (since_ns if self._speed == 1.0 else round(since_ns / self._speed))
 
     def _note_sent(self, frame: CapturedFrame, now_ns: int) -> None:
         self._next = None

@@ -39,10 +39,16 @@ class FollowingTracker:
     """A Tracker of the frames that are solved, and around it the answer to every frame.
 
     At all times received = followed + missed: `admitted` and `finished` are those followed, `lost` is 0.
+
+    patient: a frame that is being solved has its answer after that, for a source that waits for answers; then nothing
+    depends on how long anything takes.
     """
 
-    def __init__(self, config: TrackingConfig, following: FollowingConfig, policy: FollowedPolicy) -> None:
-        self._policy, self._following = policy, following
+    def __init__(
+        self, config: TrackingConfig, following: FollowingConfig, policy: FollowedPolicy, patient: bool = False
+    ) -> None:  # fmt: skip
+        self._policy, self._following, self._patient = policy, following, patient
+        self._held: StateReport | None = None
         self._solves = Tracker(replace(config, depth=1), policy)
         self._asked_ns: dict[int, int] = {}
         self._followed = self._missed = 0
@@ -68,6 +74,9 @@ class FollowingTracker:
         belief, followed = self._policy.follow(frame, image)
         outputs: list[Output | FollowedReport] = [] if followed is None else [FollowedReport(frame, followed)]
         report = StateReport(frame, 0, with_camera(belief, frame), self.counts, self._policy.level)
+        if self._patient:
+            self._held = report
+            return [*outputs, *self._ordered(self._solves.on_frame(frame, now_ns), now_ns)]
         return [*outputs, report, *self._ordered(self._solves.on_frame(frame, now_ns), now_ns)]
 
     def on_view(
@@ -76,7 +85,7 @@ class FollowingTracker:
     ) -> None:  # fmt: skip
         """A view is there; it serves following whatever comes of the solve."""
         asked_ns = self._asked_ns.pop(frame_id, None)
-        if asked_ns is not None:
+        if asked_ns is not None and not self._patient:
             took = min((now_ns - asked_ns) / NS_PER_MS, _LONGEST_AHEAD_MS)
             self._policy.ahead_ms += _SMOOTHING * (took - self._policy.ahead_ms)
         self._policy.follower.add(view_id, grey, depth, camera, cam_from_object)
@@ -121,6 +130,8 @@ class FollowingTracker:
 
     def took(self, ms: float) -> None:
         """Following a frame has taken so long; do less, or more again, if that is not what it may take."""
+        if self._patient:
+            return
         self._took_ms = ms if self._took_ms is None else self._took_ms + _SMOOTHING * (ms - self._took_ms)
         if self._between_ms is None:
             return
@@ -143,4 +154,15 @@ class FollowingTracker:
         for order in orders:
             if isinstance(order, GuessOrder):
                 self._asked_ns = {order.frame.frame_id: now_ns}
-        return [*orders]
+        return [*orders, *self._answer(outputs)]
+
+    def _answer(self, outputs: list[Output]) -> list[StateReport]:
+        """The answer to the frame that waits for its solve, once that has left; with its pose, if it has none."""
+        held = self._held
+        if held is None or self._solves.counts.in_flight > 0:
+            return []
+        self._held = None
+        solved = [output for output in outputs if isinstance(output, StateReport) and output.frame == held.frame]
+        if solved and held.belief.score == 0 and solved[-1].belief.score > 0:
+            return [replace(held, belief=solved[-1].belief)]
+        return [held]

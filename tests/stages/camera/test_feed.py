@@ -201,3 +201,40 @@ def test_progress_survives_and_belongs_to_its_source(tmp_path: Path) -> None:
 def test_settings_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         CameraConfig("folder:x", **wrong)  # type: ignore[arg-type]
+
+
+def configured(clock: Clock, sent_before: int = 0, **config: object) -> Feed:
+    return Feed(source(clock), CameraConfig("folder:x", **config), sent_before)  # type: ignore[arg-type]
+
+
+def test_the_first_frames_are_left_out_and_a_second_start_goes_on_after_them() -> None:
+    assert [frame_id for frame_id, _ in sent(configured("none", pace="fast", first=2), 0)] == [2, 3, 4]
+    assert [frame_id for frame_id, _ in sent(configured("none", 1, pace="fast", first=2), 0)] == [3, 4]
+    assert sent(configured("own", first=1), 0) == [(1, 0)]
+
+
+def test_live_frames_go_so_many_times_as_fast() -> None:
+    fast = configured("own", speed=2.0)
+    assert sent(fast, 0) == [(0, 0)]
+    assert sent(fast, 16) == []
+    assert sent(fast, 40) == [(1, 16.5), (2, 33.5)]
+
+
+@pytest.mark.parametrize(
+    ("clock", "config", "said"),
+    [
+        ("wall", {"first": 1}, "a device has no frames to leave out"),
+        ("wall", {"speed": 2.0}, "a device has no frames to leave out"),
+        ("none", {"speed": 2.0}, "speed 2 is for pace live, and this pace is lockstep"),
+        ("own", {"speed": 2.0, "pace": "fast"}, "this pace is fast"),
+    ],
+)
+def test_what_a_source_cannot_do_is_refused(clock: Clock, config: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        configured(clock, **config)
+
+
+@pytest.mark.parametrize("config", [{"first": -1}, {"speed": 0.0}])
+def test_numbers_that_cannot_be_are_refused(config: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match="must "):
+        CameraConfig("folder:x", **config)  # type: ignore[arg-type]

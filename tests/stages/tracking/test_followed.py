@@ -363,3 +363,54 @@ def test_the_limit_of_what_speaks_against_following_is_a_setting() -> None:
     video.solve_twice()
     video.solve_twice()
     assert_right(video.reports[SOLVE_AFTER:])
+
+
+def patient() -> FollowingTracker:
+    views = TrainingViews(tuple(map(str, range(len(RING)))), RING)
+    policy = FollowedPolicy(TrackingConfig(), FollowingConfig(), views, Priors(), viewpoint(22.0, 33.0), looks=False)
+    return FollowingTracker(TrackingConfig(), FollowingConfig(), policy, patient=True)
+
+
+class TestAPatientTracker:
+    """For a source that waits for answers: a frame that is being solved is answered after that."""
+
+    def play(self, count: int, took_ms: float, delay_ms: int) -> tuple[list[StateReport], list[int]]:
+        """What is believed of each frame, and how many solves there were before its answer."""
+        tracker, reports, solves = patient(), [], []
+        for number in range(count):
+            now_ns = number * FRAME_MS * MS
+            said = tracker.on_frame(FrameInfo(number, now_ns, LENS), pyramid_of(photograph(truth(number))), now_ns)
+            tracker.took(took_ms)
+            solves.append(0)
+            while not any(isinstance(one, StateReport) for one in said):
+                (order,) = [one for one in said if isinstance(one, GuessOrder)]
+                solves[-1] += 1
+                now_ns += delay_ms * MS
+                pose, true = order.guess.cam_from_object, truth(number)
+                tracker.on_view(number, f"{number}/{order.pass_index}", *grey_and_depth(pose), VIEW, pose, now_ns)
+                covariance = np.diag([1e-5] * 3 + [1e-6] * 3)
+                said = tracker.on_result(PoseResult(number, order.pass_index, true, covariance, 150, 200, 1.0), now_ns)
+            (report,) = [one for one in said if isinstance(one, StateReport)]
+            assert report.frame.frame_id == number
+            reports.append(report)
+        return reports, solves
+
+    def test_the_first_frame_has_the_pose_of_its_solve(self) -> None:
+        reports, solves = self.play(1, took_ms=1.0, delay_ms=10)
+        assert solves[0] > 0
+        assert_right(reports)
+
+    def test_nothing_depends_on_how_long_anything_takes(self) -> None:
+        quick, slow = self.play(15, took_ms=1.0, delay_ms=1), self.play(15, took_ms=500.0, delay_ms=900)
+        for one, other in zip(quick[0], slow[0], strict=True):
+            assert one.belief.cam_from_object is not None
+            assert other.belief.cam_from_object is not None
+            np.testing.assert_array_equal(one.belief.cam_from_object, other.belief.cam_from_object)
+            assert (one.belief.state, one.level) == (other.belief.state, other.level)
+        assert quick[1] == slow[1]
+
+    def test_a_reset_answers_the_frame_that_is_being_solved(self) -> None:
+        tracker = patient()
+        said = tracker.on_frame(FrameInfo(0, 0, LENS), pyramid_of(photograph(truth(0))), 0)
+        assert [type(one) for one in said] == [GuessOrder]
+        assert [one.frame.frame_id for one in tracker.restart(None, 1) if isinstance(one, StateReport)] == [0]

@@ -6,10 +6,11 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 from fieldpose.bus.codec import encode
 from fieldpose.bus.protocol import Bus
-from fieldpose.bus.requests import ControlValues, Request, decode_request, decode_values
+from fieldpose.bus.requests import R, Request, Response, decode_answer, decode_request
 from fieldpose.bus.topics import Address
 from fieldpose.errors import FieldposeError, RefusedError, TransportError
 
@@ -19,9 +20,9 @@ MOST_WAITING = 8
 
 @dataclass(eq=False)
 class _Waiting:
-    request: Request
+    request: Request[Any]
     done: threading.Event = field(default_factory=threading.Event)
-    values: ControlValues | None = None
+    values: Response | None = None
     error: Exception | None = None
 
 
@@ -50,7 +51,7 @@ class Desk:
                 self.refused += 1
             raise
 
-    def work(self, carry_out: Callable[[Request], ControlValues]) -> None:
+    def work(self, carry_out: Callable[[Request[Any]], Response]) -> None:
         """Carry out, in this thread, what waits. An exception goes to who has asked."""
         while True:
             with self._lock:
@@ -72,7 +73,7 @@ class Desk:
             waiting.error = RefusedError("it is ending; ask again once it has started again")
             waiting.done.set()
 
-    def _enter(self, request: Request) -> _Waiting:
+    def _enter(self, request: Request[Any]) -> _Waiting:
         waiting = _Waiting(request)
         with self._lock:
             if not self._open:
@@ -98,8 +99,8 @@ def _outcome(waiting: _Waiting) -> bytes:
 
 
 def ask_stage(
-    bus: Bus, address: Address, stage: str, request: Request, timeout_s: float
-) -> tuple[dict[str, ControlValues], list[str]]:  # fmt: skip
+    bus: Bus, address: Address, stage: str, request: Request[R], timeout_s: float
+) -> tuple[dict[str, R], list[str]]:  # fmt: skip
     """Ask a stage of each pipeline that `address` stands for: its answer by its key, and the refusals, a line each.
 
     Raises CodecError for a request that cannot be sent, and TransportError where nobody answers in time.
@@ -108,13 +109,13 @@ def ask_stage(
     values, refusals = {}, list(replies.refusals)
     for key, payload in sorted(replies.answers.items()):
         try:
-            values[key] = decode_values(payload)
+            values[key] = decode_answer(payload, request)
         except FieldposeError as error:
             refusals.append(f"{key}: an answer that cannot be read: {error}")
     return values, refusals
 
 
-def ask_one(bus: Bus, address: Address, stage: str, request: Request, timeout_s: float) -> ControlValues:
+def ask_one(bus: Bus, address: Address, stage: str, request: Request[R], timeout_s: float) -> R:
     """Ask the stage of one pipeline. Raises RefusedError, and what `ask_stage` raises."""
     values, refusals = ask_stage(bus, address, stage, request, timeout_s)
     if refusals:

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 from fieldpose.bus.joining import Joined, Joiner
 from fieldpose.bus.logs import Throttle, describe, stage_logger
 from fieldpose.bus.messages import Failure, Message, Reason
-from fieldpose.bus.requests import ControlValues, Request
+from fieldpose.bus.requests import Request, Response
 from fieldpose.bus.topics import FAILURE, FRAME, Topic
 
 Output = tuple[Topic[Any], Message]
@@ -59,7 +59,7 @@ class KeepsTime(Protocol):
 class Controlled(Protocol):
     """A handler that takes requests, in the thread of its other methods."""
 
-    def control(self, request: Request, now_ns: int) -> tuple[ControlValues, Iterable[Output]]:
+    def control(self, request: Request[Any], now_ns: int) -> tuple[Response, Iterable[Output]]:
         """Carry out a request; how things are then, and what is to be sent. Raises FieldposeError to refuse it."""
 
 

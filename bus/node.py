@@ -23,7 +23,7 @@ from fieldpose.bus.logs import Throttle, describe, stage_logger
 from fieldpose.bus.messages import Failure, Message, Reason, Stats
 from fieldpose.bus.ports import Inbox, InboxCounts, Outbox, Received, first_header, reply_header
 from fieldpose.bus.protocol import SETTLE_S, Bus, Closing
-from fieldpose.bus.requests import ControlValues, Request
+from fieldpose.bus.requests import Request, Response
 from fieldpose.bus.signals import Interrupted, StopSignals
 from fieldpose.bus.topics import FAILURE, STATS, Address, Topic
 from fieldpose.errors import CodecError, FieldposeError
@@ -196,7 +196,7 @@ class _Node:
             self._throttle.warning("refused", request=str(error))
             raise
 
-    def _carry_out(self, request: Request) -> ControlValues:
+    def _carry_out(self, request: Request[Any]) -> Response:
         assert isinstance(self._handler, Controlled)
         try:
             values, outputs = self._handler.control(request, time.time_ns())

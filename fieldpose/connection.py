@@ -102,7 +102,7 @@ class Connection:
             raise ConfigError(str(error)) from None
         return self._ask(request, timeout_s)
 
-    def _ask(self, request: Request, timeout_s: float) -> ControlValues:
+    def _ask(self, request: Request[ControlValues], timeout_s: float) -> ControlValues:
         return ask_one(self._bus, self._address, "tracking", request, timeout_s)
 
     def close(self) -> None:

@@ -63,7 +63,7 @@ class Options:
             raise RefusedError("; ".join(refusals))
         return 0
 
-    def request(self) -> Request:
+    def request(self) -> Request[ControlValues]:
         """What is asked. Raises UsageError and ConfigError."""
         if self.timeout_s <= 0:
             raise UsageError(f"--timeout-s is {self.timeout_s:g}, but must be above 0")
@@ -76,7 +76,7 @@ class Options:
         return _guess(self.value, self.field) if self.action == "guess" else _solving(self.value)
 
 
-_PLAIN: dict[str, Callable[[], Request]] = {"show": Show, "reset": Reset}
+_PLAIN: dict[str, Callable[[], Request[ControlValues]]] = {"show": Show, "reset": Reset}
 _EXAMPLES = {"guess": "guess train:047 --field mine.safetensors", "solve": "solve 2"}
 
 

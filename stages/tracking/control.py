@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -37,7 +38,7 @@ class Controls:
                 self._state = each.belief.state
         return said
 
-    def carry_out(self, request: Request, now_ns: int) -> tuple[ControlValues, list[Output]]:
+    def carry_out(self, request: Request[Any], now_ns: int) -> tuple[ControlValues, list[Output]]:
         """Do what is asked; how things are then, and what is to be sent. Raises RefusedError, and changes nothing."""
         if isinstance(request, Show):
             return self._values(), []
@@ -48,7 +49,7 @@ class Controls:
         self._requests += 1
         return self._values(), [(CONTROL, done), *outputs_of(self.note(said))]
 
-    def _done(self, request: Request, now_ns: int) -> tuple[Control, Sequence[Said]]:
+    def _done(self, request: Request[Any], now_ns: int) -> tuple[Control, Sequence[Said]]:
         tracker = self._tracker
         match request:
             case Reset():

@@ -72,7 +72,7 @@ class TrackingNode:
     def tick(self, now_ns: int) -> Iterable[Output]:
         return outputs_of(self._controls.note(self._tracker.on_tick(now_ns)))
 
-    def control(self, request: Request, now_ns: int) -> tuple[ControlValues, Iterable[Output]]:
+    def control(self, request: Request[Any], now_ns: int) -> tuple[ControlValues, Iterable[Output]]:
         """Carry out a request. Raises RefusedError."""
         return self._controls.carry_out(request, now_ns)
 

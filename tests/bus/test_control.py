@@ -20,7 +20,7 @@ from fieldpose.bus.control import MOST_WAITING, Desk, ask_one, ask_stage
 from fieldpose.bus.messages import Message, Stats, TrackingState
 from fieldpose.bus.node import Controlled, Output, run_node
 from fieldpose.bus.ports import Inbox, Outbox
-from fieldpose.bus.requests import ControlValues, Request, Reset, SetSolving, Show, decode_values
+from fieldpose.bus.requests import ControlValues, Request, Reset, SetSolving, Show, decode_answer
 from fieldpose.bus.topics import CAMERA_INFO, GUESS, STATS, Address, Topic
 from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus, wait_for
 from fieldpose.errors import FieldposeError, RefusedError, TransportError
@@ -65,7 +65,7 @@ class Quiet:
 class Dial(Quiet):
     """A stage with one value: it cannot be reset, breaks at 13, and says a message for each change."""
 
-    def control(self, request: Request, now_ns: int) -> tuple[ControlValues, Iterable[Output]]:
+    def control(self, request: Request[Any], now_ns: int) -> tuple[ControlValues, Iterable[Output]]:
         self.threads.add(threading.get_ident())
         if isinstance(request, Reset):
             raise RefusedError("there is nothing\n to reset")
@@ -91,7 +91,7 @@ def running(handler: Any, bus: Bus, address: Address = ADDRESS) -> Iterator[None
         assert not thread.is_alive()
 
 
-def ask(bus: Bus, request: Request, address: Address = ADDRESS) -> ControlValues:
+def ask(bus: Bus, request: Request[Any], address: Address = ADDRESS) -> ControlValues:
     return ask_one(bus, address, "tracking", request, ENOUGH_S)
 
 
@@ -274,7 +274,7 @@ class TestDesk:
         desk.work(lambda request: values(5))
         for thread in threads:
             thread.join(ENOUGH_S)
-        assert [decode_values(payload).requests for payload in answered] == [5] * MOST_WAITING
+        assert [decode_answer(payload, Show()).requests for payload in answered] == [5] * MOST_WAITING
         assert desk.refused == 1
 
     def test_when_it_closes_what_waits_is_refused_and_what_comes(self) -> None:
@@ -299,14 +299,14 @@ class TestDesk:
         """And what was refused is never carried out, whichever of the two comes first."""
         desk, done, answered = Desk(0.01), [], []
 
-        def slowly(request: Request) -> ControlValues:
+        def slowly(request: Request[Any]) -> ControlValues:
             time.sleep(0.03)
             done.append(request)
             return values(len(done))
 
         def ask_it() -> None:
             with suppress(RefusedError):
-                answered.append(decode_values(desk.answer(encode(Show()))).requests)
+                answered.append(decode_answer(desk.answer(encode(Show())), Show()).requests)
 
         while len(answered) < 3:
             thread = threading.Thread(target=ask_it)

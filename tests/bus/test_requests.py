@@ -21,22 +21,28 @@ from fieldpose.bus.requests import (
     ControlValues,
     Request,
     Reset,
+    Response,
+    SaveSnapshot,
     SetGuess,
     SetSolving,
     Show,
+    SnapshotSaved,
+    decode_answer,
     decode_request,
-    decode_values,
 )
 from fieldpose.errors import CodecError
 from fieldpose.stages.geometry import exp_se3
 
 POSE = exp_se3([0.1, 0.2, 3.0, 0.4, 0.5, 0.6])
-SAMPLES: list[Request] = [Reset(), SetGuess(cam_from_object=POSE), SetSolving(solves_per_s=2.5), Show()]
+SAMPLES: list[Request[Any]] = [
+    Reset(), SetGuess(cam_from_object=POSE), SetSolving(solves_per_s=2.5), Show(), SaveSnapshot(seconds=10.0),
+]  # fmt: skip
+SAVED = SnapshotSaved(path="out/lost-1.mcap", seconds=9.5, messages=700)
 VALUES = ControlValues(state=TrackingState.LOST, frames=7, requests=2, solves_per_s=None, begins_at=POSE)
 steady = settings(derandomize=True, deadline=None)
 
 
-def wire(request: Request) -> Any:
+def wire(request: Request[Any]) -> Any:
     return msgpack.unpackb(encode(request))
 
 
@@ -53,7 +59,7 @@ def equal(a: Any, b: Any) -> bool:
 
 
 @pytest.mark.parametrize("request_", SAMPLES, ids=lambda sample: type(sample).__name__)
-def test_every_request_comes_back(request_: Request) -> None:
+def test_every_request_comes_back(request_: Request[Any]) -> None:
     assert equal(decode_request(encode(request_)), request_)
 
 
@@ -62,11 +68,15 @@ def test_there_is_a_sample_of_every_kind() -> None:
     assert [type(sample) for sample in SAMPLES] == list(KINDS.values())
 
 
-def test_values_come_back_and_others_are_refused() -> None:
-    assert equal(decode_values(encode(VALUES)), VALUES)
-    for payload in (b"", b"\xc1", msgpack.packb({**msgpack.unpackb(encode(VALUES)), "state": "asleep"})):
+@pytest.mark.parametrize(
+    ("request_", "answer"), [(Show(), VALUES), (SaveSnapshot(seconds=1.0), SAVED)], ids=["show", "save"]
+)
+def test_each_kind_has_its_answer_and_others_are_refused(request_: Request[Any], answer: Response) -> None:
+    assert equal(decode_answer(encode(answer), request_), answer)
+    other = SAVED if answer is VALUES else VALUES
+    for payload in (b"", b"\xc1", encode(other), msgpack.packb({**msgpack.unpackb(encode(answer)), "state": "asleep"})):
         with pytest.raises(CodecError):
-            decode_values(payload)
+            decode_answer(payload, request_)
 
 
 def test_as_any_zenoh_client_may_write_it() -> None:
@@ -83,7 +93,7 @@ def test_as_any_zenoh_client_may_write_it() -> None:
         ({"request": "reset", "version": 2}, "version 2 where 1 is expected"),
         ({"request": "pause", "version": 2}, "version 2 where 1 is expected"),
         ({"request": "reset", "version": True}, "version True where 1 is expected"),
-        ({"version": 1}, "None where one of reset, set_guess, set_solving, show is expected"),
+        ({"version": 1}, "None where one of reset, set_guess, set_solving, show, save_snapshot is expected"),
         ({"request": "pause", "version": 1}, "'pause' where one of reset,"),
         ({"request": ["reset"], "version": 1}, "a list where one of reset,"),
         ({"request": "a\n\u202e" * 99, "version": 1}, "where one of reset,"),
@@ -95,6 +105,9 @@ def test_as_any_zenoh_client_may_write_it() -> None:
         ({"request": "set_solving", "version": 1, "solves_per_s": -1}, "-1 where 0 to 100 is expected"),
         ({"request": "set_solving", "version": 1, "solves_per_s": 100.5}, "100.5 where 0 to 100 is expected"),
         ({"request": "set_guess", "version": 1, "cam_from_object": None}, "cam_from_object"),
+        ({"request": "save_snapshot", "version": 1, "seconds": 0}, "seconds: 0 where a number above 0"),
+        ({"request": "save_snapshot", "version": 1, "seconds": 601}, "at most 600, is expected"),
+        ({"request": "save_snapshot", "version": 1, "seconds": float("nan")}, "seconds: not finite"),
         ([1, 2], "no map"),
         (None, "no map"),
     ],
@@ -134,7 +147,7 @@ def test_random_bytes(payload: bytes) -> None:
 
 @settings(steady, max_examples=400)
 @given(st.data(), st.sampled_from(SAMPLES))
-def test_mutated_requests(data: st.DataObject, sample: Request) -> None:
+def test_mutated_requests(data: st.DataObject, sample: Request[Any]) -> None:
     payload = bytearray(encode(sample))
     for _ in range(data.draw(st.integers(1, 4))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
@@ -151,7 +164,7 @@ def test_mutated_requests(data: st.DataObject, sample: Request) -> None:
     st.sampled_from(SAMPLES),
     st.data(),
 )
-def test_any_value_in_any_field(value: Any, sample: Request, data: st.DataObject) -> None:
+def test_any_value_in_any_field(value: Any, sample: Request[Any], data: st.DataObject) -> None:
     fields = wire(sample)
     fields[data.draw(st.sampled_from(sorted(fields)))] = value
     try:

@@ -18,7 +18,7 @@ from fieldpose.bus.protocol import (
     nobody_answers,
     refusal,
 )  # fmt: skip
-from fieldpose.bus.topics import Topic, key_matches
+from fieldpose.bus.topics import Topic, key_matches, keys_meet
 
 T = TypeVar("T")
 
@@ -56,12 +56,12 @@ class MemoryBus:
 
     def ask(self, key: str, payload: bytes, timeout_s: float) -> Replies:
         with self._room.lock:
-            served = [(name, answer) for name, answer in self._room.served if key_matches(key, name)]
+            served = [(name, answer) for name, answer in self._room.served if keys_meet(key, name)]
         answers: dict[str, bytes] = {}
         refusals: list[str] = []
         for name, answer in served:
             try:
-                answers[name] = answer(payload)
+                answers[key if "*" in name else name] = answer(payload)
             except Exception as error:
                 refusals.append(refusal(name, error))
         if not served:

@@ -57,21 +57,22 @@ class Outbox:
 class Sequences:
     """What is missing per sender, from the numbers in the headers; a restart is no gap.
 
-    Neither is joining late, unless `from_start` says that each sender's number 0 should have come.
+    Neither is joining late, unless `from_start` says that each sender's number 0 should have come. expected: by key and
+    sender, the number that its next message should have.
     """
 
-    def __init__(self, from_start: bool = False) -> None:
+    def __init__(self, from_start: bool = False, expected: Mapping[tuple[str, str], int] | None = None) -> None:
         self._from_start = from_start
         self.missing: dict[tuple[str, str], int] = {}
-        self._next: dict[tuple[str, str], int] = {}
+        self.expected: dict[tuple[str, str], int] = dict(expected or {})
 
     def seen(self, key: str, header: Header) -> int:
         """Note a message received on `key`; return how many of its sender's are missing just before it."""
         sender = (key, header.source)
-        expected = self._next.get(sender, 0 if self._from_start else header.sequence)
+        expected = self.expected.get(sender, 0 if self._from_start else header.sequence)
         # A smaller number than expected is a sender that started again, from 0.
         gap = header.sequence - expected if header.sequence >= expected else header.sequence
-        self._next[sender] = header.sequence + 1
+        self.expected[sender] = header.sequence + 1
         self.missing[sender] = self.missing.get(sender, 0) + gap
         return gap
 

@@ -49,7 +49,9 @@ class Bus(Protocol):
         """Give what arrives to `sink`; while that is held up, `capacity` messages wait (1: the newest)."""
 
     def serve(self, key: str, answer: Answer) -> Closing:
-        """Answer what is asked under a concrete key; once closed, nothing is being answered any more."""
+        """Answer what is asked under a key; once closed, nothing is being answered any more.
+
+        With a "*" in it that is every key it stands for, and the answer's key is the one that was asked."""
 
     def ask(self, key: str, payload: bytes, timeout_s: float) -> Replies:
         """Ask all who serve the key, and wait for what they say.

@@ -36,7 +36,8 @@ def _answer(query: Any, key: str, answer: Answer) -> None:
         except Exception as error:
             query.reply_err(refusal(key, error), encoding=_REFUSAL)
         else:
-            query.reply(key, payload)
+            # Who serves many keys answers under the one that was asked.
+            query.reply(str(query.key_expr) if "*" in key else key, payload)
 
 
 def asked(session: Any, key: str, payload: bytes, timeout_s: float) -> Replies | None:

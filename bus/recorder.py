@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar
 
-from fieldpose.bus.codec import decode_header
+from fieldpose.bus.codec import decode_header, encode
 from fieldpose.bus.messages import Header, Message
 from fieldpose.bus.node import Output
 from fieldpose.bus.protocol import Bus, Closing, Sink
-from fieldpose.bus.recording import RecordingWriter, partial_path, recover
+from fieldpose.bus.requests import SaveSnapshot, decode_request
+from fieldpose.bus.ring import Snapshots
 from fieldpose.bus.topics import ALL, Address, Topic
-from fieldpose.errors import CodecError, RecordingError
+from fieldpose.errors import CodecError, RecordingError, RefusedError
 
-__all__ = ["RECORDED", "Recorder", "RecorderHandler", "RecordingWriter", "partial_path", "recover"]
+NAME = "recorder"
+"""Under which it is asked for snapshots."""
+
+T = TypeVar("T")
 
 RECORDED: tuple[Topic[Any], ...] = tuple(topic for topic in ALL if topic.recorded)
 QUEUE_BYTES = 256 << 20
@@ -83,49 +86,83 @@ def _size(item: _Item) -> int:
     return len(item.content) if isinstance(item.content, bytes) else 0
 
 
-class Recorder:
-    """Records `topics` of `address`, whose parts may be "*", into a file until `close`.
+class Store(Protocol):
+    """Where a recorder writes; all methods are called from one thread, and those that write raise OSError."""
 
-    `options` are those of RecordingWriter.
+    @property
+    def messages(self) -> int:
+        """How many have been written."""
+
+    def write_payload(self, key: str, topic: Topic[Any], payload: bytes, log_time_ns: int) -> None:
+        """Write bytes from the wire; those that are no message are counted."""
+
+    def note_dropped(self, key: str, header: Header) -> None:
+        """Count a message that was received and for which there was no room in the queue."""
+
+    def flush_if_due(self) -> float:
+        """Hand over what was written lately; return the seconds until the next time."""
+
+    def close(self) -> bool:
+        """Finish; return whether nothing was lost. Raises RecordingError and OSError."""
+
+    def end_early(self, error: OSError) -> RecordingError:
+        """Finish as well as can be after a failure; what is to be told of it."""
+
+
+class Recorder:
+    """Records `topics` of `address`, whose parts may be "*", until `close`: into a store, a ring of snapshots, or both.
+
+    open_store: opens the store, once it listens. It answers requests for snapshots at the key of "recorder" there.
     """
 
     def __init__(
         self,
         bus: Bus,
         address: Address,
-        path: Path | str,
+        open_store: Callable[[], Store] | None,
+        snapshots: Snapshots | None = None,
         topics: Iterable[Topic[Any]] = RECORDED,
         queue_bytes: int = QUEUE_BYTES,
-        **options: Any,
     ) -> None:
         self.error: RecordingError | None = None
+        self.snapshots = snapshots
         self._queue = _ByteQueue(queue_bytes)
         # Listening begins first: taking over an unfinished recording can last.
-        self._subscriptions: list[Closing] = [
+        self._listening: list[Closing] = [
             bus.subscribe(address.key(topic), self._sink(topic), _CHANNEL_CAPACITY) for topic in topics
         ]
         try:
-            self.writer = RecordingWriter(path, **options)
+            self._store = open_store() if open_store is not None else None
         except BaseException:
-            self._unsubscribe()
+            self._end_listening()
             raise
         self._thread = threading.Thread(target=self._write, name="recorder", daemon=True)
         self._thread.start()
+        self._listening.append(bus.serve(address.control(NAME), self._answer))
+
+    @property
+    def messages(self) -> int:
+        """How many have been written."""
+        return self._store.messages if self._store is not None else 0
 
     def close(self) -> bool:
         """Write what is queued, finish the file, return whether it is lossless.
 
-        Raises RecordingError where writing failed; what was written before is in the unfinished file.
+        Raises RecordingError where writing failed, which says where what was written before is.
         """
-        self._unsubscribe()
+        self._end_listening()
         self._queue.end()
         self._thread.join()
+        if self.snapshots is not None:
+            self.snapshots.close()
         if self.error is not None:
             raise self.error
+        if self._store is None:
+            return True
         try:
-            return self.writer.close()
+            return self._store.close()
         except OSError as error:
-            raise self._failure(error) from error
+            raise self._store.end_early(error) from error
 
     def _sink(self, topic: Topic[Any]) -> Sink:
         def sink(key: str, payload: bytes, received_ns: int) -> None:
@@ -135,42 +172,72 @@ class Recorder:
 
         return sink
 
-    def _unsubscribe(self) -> None:
-        for subscription in self._subscriptions:
-            subscription.close()
+    def _answer(self, payload: bytes) -> bytes:
+        """Called from threads of the bus."""
+        request = decode_request(payload)
+        if not isinstance(request, SaveSnapshot):
+            raise RefusedError(f"{request.kind}: the recorder takes no such request")
+        if self.snapshots is None:
+            raise RefusedError(
+                "save_snapshot: this recorder keeps nothing in memory to be saved; start it with a folder for snapshots"
+            )
+        return encode(self.snapshots.save(request.seconds))
+
+    def _end_listening(self) -> None:
+        for listening in self._listening:
+            listening.close()
 
     def _write(self) -> None:
-        try:
-            while (items := self._queue.take(self.writer.flush_if_due())) is not None:
-                for item in items:
-                    self._write_item(item)
-                    self._queue.done(item)
-        except OSError as error:
-            self.error = self._failure(error)
-            self._queue.refuse()
+        while (items := self._queue.take(self._flush())) is not None:
+            for item in items:
+                self._write_item(item)
+                self._queue.done(item)
+
+    def _flush(self) -> float:
+        """The seconds until this is to be called again."""
+        return self._guarded(lambda store: store.flush_if_due(), 1.0)
 
     def _write_item(self, item: _Item) -> None:
-        if isinstance(item.content, Header):
-            self.writer.note_dropped(item.key, item.content)
-        else:
-            self.writer.write_payload(item.key, item.topic, item.content, item.received_ns)
+        key, topic, content, received_ns = item
+        if isinstance(content, Header):
+            self._guarded(lambda store: store.note_dropped(key, content), None)
+            return
+        if self.snapshots is not None:
+            self.snapshots.add(key, topic, content, received_ns)
+        self._guarded(lambda store: store.write_payload(key, topic, content, received_ns), None)
 
-    def _failure(self, error: OSError) -> RecordingError:
-        partial = partial_path(self.writer.path)
-        return RecordingError(
-            f"{partial}: cannot be written: {error.strerror}; `fieldpose recover` saves what is in it"
-        )
+    def _guarded(self, work: Callable[[Store], T], otherwise: T) -> T:
+        """Do something with the store, unless it has ended; where it fails it ends, and snapshots go on."""
+        if self._store is None or self.error is not None:
+            return otherwise
+        try:
+            return work(self._store)
+        except OSError as error:
+            self.error = self._store.end_early(error)
+            if self.snapshots is None:
+                self._queue.refuse()
+            return otherwise
 
 
 class RecorderHandler:
-    """A recorder as a process of its own; it listens from when it is made and finishes the file when stopped."""
+    """A recorder as a process of its own; it listens from when it is made and finishes the file when stopped.
 
-    name = "recorder"
+    Where nothing can be written any more, that is said once, and the process stays: nobody is to wait for it.
+    """
+
+    name = NAME
     inputs: tuple[Topic[Any], ...] = ()
     outputs: tuple[Topic[Any], ...] = ()
 
-    def __init__(self, bus: Bus, address: Address, path: Path | str, **options: Any) -> None:
-        self._recorder = Recorder(bus, address, path, **options)
+    def __init__(
+        self,
+        bus: Bus,
+        address: Address,
+        open_store: Callable[[], Store] | None,
+        snapshots: Snapshots | None = None,
+    ) -> None:
+        self._recorder = Recorder(bus, address, open_store, snapshots)
+        self._said = False
 
     def start(self) -> None:
         """Nothing to load."""
@@ -179,7 +246,8 @@ class RecorderHandler:
         return ()
 
     def tick(self, now_ns: int) -> Iterable[Output]:
-        if self._recorder.error is not None:
+        if self._recorder.error is not None and not self._said:
+            self._said = True
             raise self._recorder.error
         return ()
 

@@ -7,7 +7,7 @@ import os
 import struct
 import threading
 import time
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,6 +29,10 @@ from fieldpose.errors import CodecError, RecordingError
 
 SOURCE_RECORD = "fieldpose.source"
 RECORDING_RECORD = "fieldpose.recording"
+SNAPSHOT_RECORD = "fieldpose.snapshot"
+PART_RECORD = "fieldpose.part"
+EXPECTED_RECORD = "fieldpose.expected"
+"""Of a part that is not the first: "KEY SENDER" -> the number that this sender's next message should have."""
 _RECORD_LIMIT = 1 << 30
 _RECORD_HEAD, _CHUNK_HEAD = 9, 32
 _DAMAGE = (
@@ -50,6 +54,15 @@ class Payload(NamedTuple):
     key: str
     data: bytes
     log_time_ns: int
+    publish_ns: int = 0
+    sequence: int = 0
+
+
+class Kind(NamedTuple):
+    """How a topic's messages are encoded, and the name, encoding and bytes of their schema."""
+
+    encoding: str
+    schema: tuple[str, str, bytes]
 
 
 class Attachment(NamedTuple):
@@ -70,13 +83,18 @@ class TopicInfo:
 
 @dataclass(frozen=True)
 class SourceInfo:
-    """`missing` did not reach the recorder; what is received and not written found its queue full."""
+    """`missing` did not reach the recorder; what is received and not written found its queue full.
+
+    first, last: the sender's own numbers of what was received, None in files of older versions.
+    """
 
     key: str
     source: str
     received: int
     written: int
     missing: int
+    first: int | None = None
+    last: int | None = None
 
 
 @dataclass(frozen=True)
@@ -93,6 +111,11 @@ class RecordingInfo:
     sources: list[SourceInfo] = field(default_factory=list)
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def ended(self) -> str | None:
+        """Why nothing was written any more, where that was not the wish of whoever recorded."""
+        return self.metadata.get(RECORDING_RECORD, {}).get("ended")
 
     def of(self, address: Address) -> RecordingInfo:
         """What of it belongs to one pipeline."""
@@ -150,6 +173,40 @@ def info(path: Path | str) -> RecordingInfo:
         metadata=named,
         attachments=attachments,
     )
+
+
+def joined(parts: Sequence[RecordingInfo]) -> RecordingInfo | None:
+    """What the parts of a recording hold together, under the name of the last; None without any."""
+    if not parts:
+        return None
+    topics: dict[str, list[TopicInfo]] = {}
+    sources: dict[tuple[str, str], list[SourceInfo]] = {}
+    for part in parts:
+        for topic in part.topics:
+            topics.setdefault(topic.key, []).append(topic)
+        for source in part.sources:
+            sources.setdefault((source.key, source.source), []).append(source)
+    return replace(
+        parts[-1],
+        size_bytes=sum(part.size_bytes for part in parts),
+        messages=sum(part.messages for part in parts),
+        first_ns=min((part.first_ns for part in parts if part.messages), default=0),
+        last_ns=max(part.last_ns for part in parts),
+        lossless=all(part.lossless for part in parts),
+        topics=[_joined_topic(those) for _, those in sorted(topics.items())],
+        sources=[_joined_source(those) for _, those in sorted(sources.items())],
+    )
+
+
+def _joined_topic(parts: Sequence[TopicInfo]) -> TopicInfo:
+    messages, first, last = sum(p.messages for p in parts), parts[0].first_ns, parts[-1].last_ns
+    rate_hz = (messages - 1) / ((last - first) / 1e9) if last > first else 0.0
+    return replace(parts[0], messages=messages, first_ns=first, last_ns=last, rate_hz=rate_hz)
+
+
+def _joined_source(parts: Sequence[SourceInfo]) -> SourceInfo:
+    counts = {name: sum(getattr(part, name) for part in parts) for name in ("received", "written", "missing")}
+    return replace(parts[0], **counts, last=parts[-1].last)
 
 
 def of_another_program(path: Path | str) -> str | None:
@@ -213,6 +270,7 @@ class Salvage:
     path: Path | str
     metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
     attachments: list[Attachment] = field(default_factory=list)
+    kinds: dict[str, Kind] = field(default_factory=dict)
     damage: str | None = None
 
     def payloads(self) -> Iterator[Payload]:
@@ -239,11 +297,18 @@ class Salvage:
                 yield from self._read(inside, channels)
 
     def _read(self, reader: StreamReader, channels: dict[int, str]) -> Iterator[Payload]:
+        schemas: dict[int, tuple[str, str, bytes]] = {}
         for record in reader.records:
-            if isinstance(record, records.Channel):
+            if isinstance(record, records.Schema):
+                schemas[record.id] = (record.name, record.encoding, record.data)
+            elif isinstance(record, records.Channel):
                 channels[record.id] = record.topic
+                # The schema stands before it, but not once more in the chunk that a file ends in.
+                if record.schema_id in schemas:
+                    self.kinds[record.topic] = Kind(record.message_encoding, schemas[record.schema_id])
             elif isinstance(record, records.Message):
-                yield Payload(channels[record.channel_id], record.data, record.log_time)
+                key, data = channels[record.channel_id], record.data
+                yield Payload(key, data, record.log_time, record.publish_time, record.sequence)
             elif isinstance(record, records.Metadata):
                 self.metadata.append((record.name, record.metadata))
             elif isinstance(record, records.Attachment):
@@ -331,4 +396,5 @@ def _topic_info(key: str, times: list[int]) -> TopicInfo:
 
 def _source_info(values: dict[str, str]) -> SourceInfo:
     counts = (int(values[name]) for name in ("received", "written", "missing"))
-    return SourceInfo(values["key"], values["source"], *counts)
+    ends = (int(values[name]) if name in values else None for name in ("first", "last"))
+    return SourceInfo(values["key"], values["source"], *counts, *ends)

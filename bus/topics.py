@@ -65,6 +65,12 @@ def key_matches(pattern: str, key: str) -> bool:
     return len(parts) == len(others) and all(a in ("*", b) for a, b in zip(parts, others, strict=True))
 
 
+def keys_meet(a: str, b: str) -> bool:
+    """Whether there is a concrete key that both patterns listen to."""
+    parts, others = a.split("/"), b.split("/")
+    return len(parts) == len(others) and all(x == y or "*" in (x, y) for x, y in zip(parts, others, strict=True))
+
+
 def _check_part(name: str, part: str) -> None:
     if not _PART.fullmatch(part):
         raise TransportError(f"{name} {part!r}: a part of a key has letters, digits, '_', '.' and '-', or is '*'")

@@ -11,7 +11,7 @@ back.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -41,6 +41,7 @@ from fieldpose.bus.topics import (
 )  # fmt: skip
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan
+from fieldpose.deploy.recording_options import RecordingOptions
 from fieldpose.errors import ConfigError, UsageError
 from fieldpose.stages.camera.sources import EXTERNAL, knows_truth
 from fieldpose.stages.cores import usable_cores
@@ -60,11 +61,13 @@ Topics = tuple[Topic[Any], ...]
 class Launch:
     """What only a process has.
 
-    bus; record: what it records into; plans: of all pipelines that it serves; wait_until_ready: returns once all are.
+    bus; record: what it records into; recording: how; plans: of all pipelines that it serves; wait_until_ready:
+    returns once all are.
     """
 
     bus: Bus | None = None
     record: Path | None = None
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
     plans: tuple[Plan, ...] = ()
     wait_until_ready: Callable[[], None] = lambda: None
 
@@ -95,19 +98,19 @@ class Process:
 def _recorder(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.bus.recorder import RecorderHandler
     from fieldpose.deploy.reporting.provenance import attachments, metadata
+    from fieldpose.stages.nerf.field import load_metadata
 
-    if launch.record is None or launch.bus is None:
-        raise UsageError("the recorder needs --record FILE.mcap")
+    options = launch.recording
+    if launch.bus is None or (launch.record is None and options.snapshots is None):
+        raise UsageError("the recorder needs --record FILE.mcap, or --record.snapshots DIR")
     plans = launch.plans or (parts.plan,)
-    return RecorderHandler(
-        launch.bus,
-        shared_address([plan.settings.address for plan in plans]),
-        launch.record,
-        metadata=metadata(plans),
-        attachments=attachments(plans),
-        resume=True,
-        from_start=True,
-    )
+    options.check_form(launch.record, len(plans))
+    address = shared_address([plan.settings.address for plan in plans])
+    about, attached = metadata(plans), attachments(plans)
+    path = None if options.format == "fieldpose" else plans[0].field
+    known = None if path is None else load_metadata(path)
+    store = options.store(launch.record, address, about, attached, known, resume=True, from_start=True)
+    return RecorderHandler(launch.bus, address, store, options.keep(about, attached))
 
 
 def _camera(parts: Parts, launch: Launch) -> Handler:

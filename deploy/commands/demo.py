@@ -12,14 +12,17 @@ from typing import Annotated
 import tyro
 from rich.progress import Progress
 
-from fieldpose.deploy.commands.run import INTERRUPTED, draw, planned
+from fieldpose.bus.replay import info
+from fieldpose.deploy.commands.run import INTERRUPTED, check_recorded, draw, planned
 from fieldpose.deploy.processes.pipeline import Run, run_pipelines
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_bytes, write_json
+from fieldpose.deploy.reporting.provenance import RUN_RECORD
 from fieldpose.deploy.reporting.report import live_line, print_summary
 from fieldpose.deploy.reporting.results import RunResult, summarise
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import Settings
 from fieldpose.deploy.viewing.beside import page_beside
+from fieldpose.errors import RecordingError
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class Options:
         recording = self.out / "recording.mcap"
         check_writable(recording, self.json)
         camera = replace(self.settings.camera, source=f"mcap:{sequence}")
+        _remove_earlier(recording, sequence.name)
         plan = planned(replace(self.settings, camera=camera), field)
         with page_beside((plan,), None, self.view) as hub, live_line("demo") as report:
             (outcome,) = run_pipelines(Run((plan,), recording, hub, self.logs), report)
@@ -66,6 +70,7 @@ class Options:
             return INTERRUPTED
         written.append(self.out / "timeline.png")
         draw(outcome, plan, written[-1], "demo")
+        check_recorded(outcome)
         if self.video:
             written += self._show(outcome, field, recording)
         print(f"written: {', '.join(map(str, written))}")
@@ -85,6 +90,15 @@ class Options:
             return []
         write_bytes(still, encoded(best.pixels, still))
         return [still, video]
+
+
+def _remove_earlier(recording: Path, sequence: str) -> None:
+    """Make room where an earlier demo has left its recording; another one is never touched."""
+    if not recording.exists():
+        return
+    if not info(recording).metadata.get(RUN_RECORD, {}).get("source", "").endswith(f"/{sequence}"):
+        raise RecordingError(f"{recording}: is there already, and is no recording of a demo; give another --out")
+    recording.unlink()
 
 
 @contextmanager

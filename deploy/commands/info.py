@@ -13,7 +13,7 @@ import tyro
 from rich.table import Table
 
 from fieldpose.bus.messages import CameraInfo
-from fieldpose.bus.replay import RECORDING_RECORD, RecordingInfo, info, read_recording
+from fieldpose.bus.replay import PART_RECORD, RECORDING_RECORD, SNAPSHOT_RECORD, RecordingInfo, info, read_recording
 from fieldpose.bus.topics import CAMERA_INFO
 from fieldpose.deploy.reporting.output import result_console, write_json
 from fieldpose.deploy.reporting.provenance import EDIT_RECORD, PLAN_RECORD, RUN_RECORD
@@ -73,11 +73,23 @@ def _description(recording: RecordingInfo, cameras: Mapping[str, int]) -> Iterat
     size = f"{recording.size_bytes / 1e6:.1f} MB"
     yield f"{recording.path}: {recording.messages} messages in {seconds:.1f} s from {began}, {size}"
     yield "no message lost" if recording.lossless else f"NOT LOSSLESS{_why(recording)}"
+    yield from _origin(recording)
     yield from _noted(recording, RUN_RECORD, "")
     yield from (f"  camera {CAMERA_ORIGINS[origin]}: {count} frames" for origin, count in cameras.items())
     yield from _noted(recording, PLAN_RECORD, "planned: ")
     yield from _noted(recording, EDIT_RECORD, "edited: ")
     yield from (f"  attached: {name} ({count} bytes)" for name, count in recording.attachments.items())
+
+
+def _origin(recording: RecordingInfo) -> Iterator[str]:
+    """Whether it is a part of a longer one, or was kept for a snapshot."""
+    part, snapshot = recording.metadata.get(PART_RECORD), recording.metadata.get(SNAPSHOT_RECORD)
+    if part is not None:
+        kept = "no message lost between them" if recording.lossless else "what is missing here may be between them"
+        yield f"  part {part['part']} of a recording, goes on with {part['before']}; {kept}"
+    if snapshot is not None:
+        why = "when tracking was lost" if snapshot["why"] == "lost" else "when it was asked for"
+        yield f"  a snapshot of the last {float(snapshot['seconds']):.1f} s, saved {why}"
 
 
 def _noted(recording: RecordingInfo, record: str, what: str) -> Iterator[str]:
@@ -97,6 +109,8 @@ def _why(recording: RecordingInfo) -> str:
         reasons.append(f"{missing} messages did not come, {unwritten} came and found no room")
     if noted.get("refused", "0") != "0":
         reasons.append(f"{noted['refused']} were refused")
+    if recording.ended is not None:
+        reasons.append(f"it ended early ({recording.ended})")
     if "damage" in noted:
         reasons.append(f"recovered from a damaged file ({noted['damage']})")
     return ": " + "; ".join(reasons) if reasons else ""

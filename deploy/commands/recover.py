@@ -7,7 +7,8 @@ from pathlib import Path
 
 import tyro
 
-from fieldpose.bus.recording import partial_path, recover
+from fieldpose.bus.open_recording import partial_path
+from fieldpose.bus.recovery import recover
 from fieldpose.errors import RecordingError
 
 

@@ -16,7 +16,7 @@ import tyro
 from fieldpose.bus.messages import State
 from fieldpose.bus.replay import RecordingInfo, info, read_recording
 from fieldpose.bus.topics import STATE, Address
-from fieldpose.deploy.commands.run import INTERRUPTED, planned
+from fieldpose.deploy.commands.run import INTERRUPTED, check_recorded, planned
 from fieldpose.deploy.graph import GRAPH, threads_of
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.processes.pipeline import run_pipeline
@@ -143,7 +143,9 @@ class Options:
         figures = {**comparison, "replay": summary}
         if self.check is None or record is None or outcome.interrupted:
             write_json(self.json, figures)
+            check_recorded(outcome)
             return INTERRUPTED if outcome.interrupted else 0
+        check_recorded(outcome)
         topics = compared(self.recording, record, address, first_ns).topics()
         # At its own pace frames are dropped at the door, and counted there.
         answered = outcome.sent if self.rate or self.pace == "live" else _answered(outcome)

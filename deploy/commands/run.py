@@ -14,6 +14,7 @@ import tyro
 
 from fieldpose.deploy.plan import Plan, resolve
 from fieldpose.deploy.processes.pipeline import Run, run_pipelines
+from fieldpose.deploy.recording_options import RecordingOptions
 from fieldpose.deploy.reporting.output import check_picture, check_writable, write_bytes, write_json
 from fieldpose.deploy.reporting.report import live_line, print_plan, print_summary
 from fieldpose.deploy.reporting.results import RunResult, summarise, to_csv
@@ -21,6 +22,7 @@ from fieldpose.deploy.reporting.trajectories import PoseFiles, Trajectory, in_wo
 from fieldpose.deploy.rig import planned_rig, read_rig
 from fieldpose.deploy.settings import Settings, overridden
 from fieldpose.deploy.viewing.beside import page_beside
+from fieldpose.errors import RecordingError, UsageError
 from fieldpose.stages.camera.config import Pace
 from fieldpose.stages.nerf.field import load_field, load_metadata
 from fieldpose.stages.nerf.training_views import training_views
@@ -54,6 +56,9 @@ class Options:
     --camera.source)."""
     record: Path | None = None
     """Record every message into this file (.mcap)."""
+    recording: Annotated[RecordingOptions, tyro.conf.arg(name="record")] = dataclasses.field(
+        default_factory=RecordingOptions
+    )
     json: Path | None = None
     """Write the figures of the run into this file."""
     csv: Path | None = None
@@ -114,6 +119,8 @@ class Options:
                 print_plan(plan, title)
             return 0
         check_writable(self.record, self.json, self.csv, self._page)
+        if self.report is not None and (self.recording.split is not None or self.recording.format == "foxglove"):
+            raise UsageError("--report reads one recording of fieldpose's own; leave out --record.split and foxglove")
         check_picture(self.plot)
         files = [self._pose_files(plan, len(plans) > 1) for plan in plans]
         for file in files:
@@ -121,13 +128,14 @@ class Options:
         named = titles[0] if len(plans) == 1 else f"{len(plans)} pipelines"
         with _recording_for(self.report, self.record) as recording:
             with page_beside(plans, self.listen, self.view) as hub, live_line(named) as report:
-                outcomes = run_pipelines(Run(plans, recording, hub, self.logs), report)
+                outcomes = run_pipelines(Run(plans, recording, hub, self.logs, self.recording), report)
             self._write(plans, titles, outcomes)
             for plan, outcome, file in zip(plans, outcomes, files, strict=True):
                 for line in file.write(Trajectory(plan.settings.address, _unit(plan), outcome.frames)):
                     print(line)
             if recording is not None:
                 self._write_pages(plans, titles, outcomes, recording)
+        check_recorded(outcomes[0])
         return INTERRUPTED if any(outcome.interrupted for outcome in outcomes) else 0
 
     def _write(self, plans: Sequence[Plan], titles: Sequence[str], outcomes: Sequence[RunResult]) -> None:
@@ -179,6 +187,12 @@ class Options:
             matching=overridden(s.matching, matcher=self.matcher),
             refinement=overridden(s.refinement, when=self.refine),
         )
+
+
+def check_recorded(outcome: RunResult) -> None:
+    """Raise RecordingError where not everything of a run was recorded that should have been."""
+    if outcome.recording_error is not None:
+        raise RecordingError(outcome.recording_error)
 
 
 @contextmanager

@@ -34,6 +34,7 @@ from fieldpose.deploy.processes.lifeline import die_with_parent
 from fieldpose.deploy.processes.preload import field_of, pipelines_of
 from fieldpose.deploy.processes.threads import hold_to
 from fieldpose.deploy.processes.warmup import compile_kernels
+from fieldpose.deploy.recording_options import RecordingOptions
 from fieldpose.deploy.settings import Settings
 from fieldpose.errors import UsageError
 
@@ -71,6 +72,9 @@ class Options:
     field: Annotated[Path | None, tyro.conf.arg(help=_FIELD)] = None
     record: Path | None = None
     """The recorder's file (.mcap)."""
+    recording: Annotated[RecordingOptions, tyro.conf.arg(name="record")] = dataclasses.field(
+        default_factory=RecordingOptions
+    )
     pipelines: Path | None = None
     """A file that lists several pipelines, their settings and fields; this process serves them in turn."""
     threads: int | None = None
@@ -122,7 +126,7 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     first = awaited if row.name != CAMERA else tuple(name for name in awaited if name.rpartition("/")[2] not in STAGES)
 
     try:
-        launch = Launch(bus, options.record, plans, wait_until_ready)
+        launch = Launch(bus, options.record, options.recording, plans, wait_until_ready)
         # A recorder is one for all.
         those = each[:1] if row.name == RECORDER else each
         handlers = [(make(parts, launch), parts.settings.address) for parts in those]

@@ -12,7 +12,8 @@ import cv2
 import msgspec
 import numpy as np
 
-from fieldpose.bus.recording import RecordingWriter, partial_path
+from fieldpose.bus.open_recording import partial_path
+from fieldpose.bus.recording import RecordingWriter
 from fieldpose.bus.replay import Attachment, info, read_attachment
 from fieldpose.deploy.evaluation.edits import edit_of, parameters_of
 from fieldpose.deploy.evaluation.film import FrameLog

@@ -15,7 +15,7 @@ from fieldpose.deploy.foxglove.converter import Converted, Converter, clock_behi
 from fieldpose.deploy.reporting.trajectories import in_words
 from fieldpose.stages.nerf.metadata import FieldMetadata
 
-_RECORD = "fieldpose"
+RECORD = "fieldpose"
 _LATEST_NS = 5_000_000_000
 _ROOM = 512 << 20
 
@@ -38,9 +38,15 @@ def export(recording: Path, out: Path, address: Address, field: FieldMetadata | 
             topic = message.channel.topic
             writer.write(topic, message.payload, message.log_ns, message.publish_ns, message.sequence)
             counts[topic] += 1
-        about = {"recording": recording.name, "object": address.object, "camera": address.camera}
-        writer.add(_RECORD, {**about, "lengths": in_words(field)})
+        writer.add(RECORD, about(recording.name, address, field))
     return dict(counts)
+
+
+def about(recording: str, address: Address, field: FieldMetadata | None) -> dict[str, str]:
+    """What the file says of itself."""
+    return {
+        "recording": recording, "object": address.object, "camera": address.camera, "lengths": in_words(field),
+    }  # fmt: skip
 
 
 def _behind_ns(recording: Path, address: Address) -> int:

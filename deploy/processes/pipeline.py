@@ -8,13 +8,12 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from fieldpose.bus.messages import State
-from fieldpose.bus.recording import partial_path
-from fieldpose.bus.replay import RecordingInfo, info
+from fieldpose.bus.replay import RecordingInfo, info, joined
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address, shared_address
 from fieldpose.bus.transport import ZenohBus
@@ -24,8 +23,9 @@ from fieldpose.deploy.processes.collector import Collector
 from fieldpose.deploy.processes.endpoints import check_free, free_port, peer_address
 from fieldpose.deploy.processes.programs import members, preloading, programs
 from fieldpose.deploy.processes.supervision import Supervisor
+from fieldpose.deploy.recording_options import RecordingOptions, recorded_files, unfinished_files
 from fieldpose.deploy.reporting.results import RunResult
-from fieldpose.errors import OutputError, ProcessError, RecordingError
+from fieldpose.errors import OutputError, ProcessError
 
 _START_S = 300.0
 _RESTARTS_AT_START, _RESTARTS = 2, 10
@@ -40,13 +40,19 @@ _RECORDER_FINISHES_S = 60.0
 class Run:
     """Plans on this machine, of one pipeline each, with one hub and one recorder.
 
-    listen: the hub's address (default: a free port); logs: a folder to keep.
+    listen: the hub's address (default: a free port); logs: a folder to keep; recording: how it is recorded.
     """
 
     plans: tuple[Plan, ...]
     record: Path | None = None
     listen: str | None = None
     logs: Path | None = None
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
+
+    @property
+    def recorded(self) -> bool:
+        """Whether there is a recorder, be it for snapshots alone."""
+        return self.record is not None or self.recording.snapshots is not None
 
 
 @dataclass(frozen=True)
@@ -87,13 +93,14 @@ def run_pipelines(run: Run, report: Report = lambda progress: None) -> list[RunR
     """Run the sources to their ends, or until Ctrl-C or SIGTERM, and end every process; gives a result for each plan.
 
     Raises ProcessError where a process cannot start or does not stay up, TransportError for a bad or used address,
-    RecordingError for a recording that is in the way or could not be finished.
+    RecordingError for a recording that is in the way. One that could not be finished is told of in the results: for
+    want of a disk nothing stops tracking.
     """
-    _check_recording(run.record)
+    run.recording.check(run.record, len(run.plans))
     check_free(run.listen)
     with StopSignals() as signals, _folder(run.logs) as folder:
         hub = run.listen or f"tcp/127.0.0.1:{free_port()}"
-        made = programs(run.plans, folder, hub, run.record)
+        made = programs(run.plans, folder, hub, run.record, run.recording)
         with Supervisor(folder, made, preloading(folder)) as supervisor:
             return _Running(run, supervisor, hub, signals, report).run()
 
@@ -101,7 +108,7 @@ def run_pipelines(run: Run, report: Report = lambda progress: None) -> list[RunR
 class _Running:
     def __init__(self, run: Run, supervisor: Supervisor, hub: str, signals: StopSignals, report: Report) -> None:
         self._of, self._plans = run, run.plans
-        self._members = members(run.plans, run.record is not None)
+        self._members = members(run.plans, run.recorded)
         self._cameras = [member.name for member in self._members if member.row.name == CAMERA]
         self._collectors: list[Collector] = []
         self._supervisor = supervisor
@@ -128,9 +135,9 @@ class _Running:
                 collector.close()
         finally:
             bus.close()
-        recording = _recording(self._of.record, self._supervisor)
+        recording, recording_error = recorded_by(self._of, self._supervisor)
         return [
-            self._result(plan, collector, recording, finished, start_s)
+            replace(self._result(plan, collector, recording, finished, start_s), recording_error=recording_error)
             for plan, collector in zip(self._plans, self._collectors, strict=True)
         ]
 
@@ -211,23 +218,19 @@ class _Running:
         return Progress(phase, standings=tuple(standings), restarts=restarts, pids=self._pids)
 
 
-def _check_recording(path: Path | None) -> None:
-    """Raise RecordingError for a recording that cannot be begun."""
-    if path is None:
-        return
-    if partial_path(path).exists():
-        raise RecordingError(
-            f"{partial_path(path)}: an unfinished recording is in the way; `fieldpose recover {path}` saves what is"
-            " in it, or remove it"
-        )
-
-
-def _recording(path: Path | None, supervisor: Supervisor) -> RecordingInfo | None:
-    if path is None or not supervisor.has_run(RECORDER):
-        return None
-    if partial_path(path).exists() or not path.exists():
-        raise RecordingError(f"{path}: the recording was not finished: {supervisor.last_line(RECORDER)}")
-    return info(path)
+def recorded_by(run: Run, supervisor: Supervisor) -> tuple[RecordingInfo | None, str | None]:
+    """What a run's recorder has written in fieldpose's own messages, and why that is not all, in a line."""
+    if run.record is None or not supervisor.has_run(RECORDER):
+        return None, None
+    split = run.recording.split is not None
+    error = None
+    if any(unfinished_files(path, split) for path in run.recording.files(run.record)):
+        error = f"{run.record}: the recording was not finished: {supervisor.last_line(RECORDER)}"
+    native = () if run.recording.format == "foxglove" else recorded_files(run.record, split)
+    held = joined([info(path) for path in native])
+    if held is not None and held.ended is not None:
+        error = f"{held.path}: the recording ended early: {held.ended}; what came before is in it"
+    return held, error
 
 
 @contextmanager

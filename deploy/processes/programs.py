@@ -26,8 +26,10 @@ from fieldpose.deploy.graph import (
 from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.processes.forking import FIELDPOSE
 from fieldpose.deploy.processes.supervision import Program
+from fieldpose.deploy.recording_options import RecordingOptions
 from fieldpose.deploy.settings import to_json
 
+_PLAIN = RecordingOptions()
 SETTINGS, PROGRESS, PIPELINES = "settings", "camera-progress", "pipelines.json"
 
 
@@ -62,11 +64,18 @@ def _in_order(row: Process, plans: Sequence[Plan]) -> tuple[Plan, ...]:
     return tuple(sorted(plans, key=lambda plan: plan.settings.address.object != plan.settings.camera.truth_of))
 
 
-def programs(plans: Sequence[Plan], folder: Path, hub: str, record: Path | None) -> list[Program]:
+def programs(
+    plans: Sequence[Plan], folder: Path, hub: str, record: Path | None, recording: RecordingOptions = _PLAIN
+) -> list[Program]:
     """The command line and environment of each process; what they read is left in `folder`."""
-    everyone = members(plans, record is not None)
+    everyone = members(plans, record is not None or recording.snapshots is not None)
     _write_settings(plans, folder, everyone)
-    return [_program(member, everyone, plans, folder, hub, record) for member in everyone]
+    made = [_program(member, everyone, plans, folder, hub) for member in everyone]
+    recorder = ([] if record is None else ["--record", str(record.resolve())]) + recording.arguments("record.")
+    return [
+        replace(program, command=[*program.command, *recorder]) if member.row.name == RECORDER else program
+        for member, program in zip(everyone, made, strict=True)
+    ]
 
 
 def preloading(folder: Path) -> tuple[str, ...]:
@@ -75,7 +84,7 @@ def preloading(folder: Path) -> tuple[str, ...]:
 
 
 def _program(
-    member: Member, everyone: Sequence[Member], plans: Sequence[Plan], folder: Path, hub: str, record: Path | None
+    member: Member, everyone: Sequence[Member], plans: Sequence[Plan], folder: Path, hub: str
 ) -> Program:  # fmt: skip
     row, plan = member.row, member.plans[0]
     threads = threads_of(row, max(plan.in_flight for plan in member.plans))
@@ -85,8 +94,6 @@ def _program(
     command += ["--threads", str(threads)]
     if row.serves == "run" and row.make is not None and len(plans) > 1:
         command += ["--pipelines", str(folder / PIPELINES)]
-    if row.name == RECORDER and record is not None:
-        command += ["--record", str(record.resolve())]
     if row.name != HUB:
         command += ["--wait-for", *_awaited(member, everyone, plans)]
     environment = thread_environment(threads)

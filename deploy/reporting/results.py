@@ -119,7 +119,8 @@ class RunResult:
     """What a run has left: its frames, and what was heard of its processes.
 
     `sent`: frames by the camera's own numbers; `observed`: messages that the command itself has heard, by key;
-    `interrupted`: by Ctrl-C or SIGTERM, before the source had ended; `start_s`: until all processes were ready.
+    `recording_error`: why not everything was recorded that should have been; `interrupted`: by Ctrl-C or SIGTERM,
+    before the source had ended; `start_s`: until all processes were ready.
     """
 
     frames: Sequence[FrameResult]
@@ -129,6 +130,7 @@ class RunResult:
     restarts: Mapping[str, int] = field(default_factory=dict)
     recording: RecordingInfo | None = None
     plan: Mapping[str, str] = field(default_factory=dict)
+    recording_error: str | None = None
     interrupted: bool = False
     start_s: float = 0.0
 

@@ -19,7 +19,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from fieldpose.bus.messages import Frame, Header, Truth
-from fieldpose.bus.recorder import RecordingWriter
+from fieldpose.bus.recording import RecordingWriter
 from fieldpose.bus.topics import FRAME, TRUTH, Address
 from fieldpose.stages.geometry import Camera
 

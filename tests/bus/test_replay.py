@@ -16,7 +16,8 @@ from support.bus_samples import ADDRESS, every_message, frame, guess, same, trut
 from fieldpose.bus.codec import encode
 from fieldpose.bus.messages import CameraOrigin, Header
 from fieldpose.bus.ports import Inbox
-from fieldpose.bus.recorder import RecordingWriter, recover
+from fieldpose.bus.recording import RecordingWriter
+from fieldpose.bus.recovery import recover
 from fieldpose.bus.replay import Attachment, info, read_attachment, read_recording, replay
 from fieldpose.bus.topics import FRAME, GUESS, STATE, TRUTH, Address
 from fieldpose.bus.transport import MemoryBus

@@ -11,7 +11,7 @@ import pytest
 from support import sequences
 
 from fieldpose.bus.messages import Encoding
-from fieldpose.bus.recorder import RecordingWriter
+from fieldpose.bus.recording import RecordingWriter
 from fieldpose.bus.replay import info, read_recording
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.evaluation.edited import read_edit, read_visibility

@@ -9,7 +9,7 @@ import numpy as np
 from support.pictures import picture
 
 from fieldpose.bus.messages import Encoding
-from fieldpose.bus.recorder import RecordingWriter
+from fieldpose.bus.recording import RecordingWriter
 from fieldpose.bus.topics import Address
 from fieldpose.stages.camera.core import CapturedFrame, TruePose
 from fieldpose.stages.camera.wire import messages_of

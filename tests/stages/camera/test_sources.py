@@ -16,7 +16,7 @@ from support.posed_images import CAMERA, write_blender, write_transforms
 
 from fieldpose.bus.messages import CameraOrigin, Frame, Truth
 from fieldpose.bus.node import first_header
-from fieldpose.bus.recorder import RecordingWriter
+from fieldpose.bus.recording import RecordingWriter
 from fieldpose.bus.topics import FRAME, TRUTH, Address
 from fieldpose.errors import DatasetError, SourceError
 from fieldpose.stages.camera.config import CameraConfig

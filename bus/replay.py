@@ -175,6 +175,17 @@ def info(path: Path | str) -> RecordingInfo:
     )
 
 
+def counts_of(path: Path | str) -> tuple[list[SourceInfo], bool]:
+    """What a recording says of each sender, and whether it is lossless, without reading its messages.
+
+    Raises RecordingError for a file that is no whole recording.
+    """
+    with _reader(path) as reader:
+        metadata = [(record.name, record.metadata) for record in reader.iter_metadata()]
+    sources = [_source_info(values) for name, values in metadata if name == SOURCE_RECORD]
+    return sources, dict(metadata).get(RECORDING_RECORD, {}).get("lossless") == "true"
+
+
 def joined(parts: Sequence[RecordingInfo]) -> RecordingInfo | None:
     """What the parts of a recording hold together, under the name of the last; None without any."""
     if not parts:

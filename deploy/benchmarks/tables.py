@@ -103,6 +103,21 @@ def print_match(figures: dict[str, Any]) -> None:
         console.print(f"{name} is left out: {reason}", highlight=False, markup=False)
 
 
+def print_record(figures: dict[str, Any]) -> None:
+    """What was lost, and what recording took."""
+    rss = figures["rss_mb"]
+    mb = {name: "-" if value is None else f"{value:.0f}" for name, value in rss.items()}
+    result_console().print(
+        f"{figures['sent']} messages in {figures['seconds']:.0f} s, {figures['mb_per_s']:.0f} MB/s,"
+        f" {figures['parts']} parts: {figures['lost']} lost\n"
+        f"by the senders' numbers {figures['missing_by_sequence']} are missing; {figures['unwritten']} found no room\n"
+        f"{figures['cpu_share']:.2f} cores; MB of memory: {mb['before']} before, {mb['after_a_tenth']} after a tenth,"
+        f" {mb['end']} in the end, {mb['highest']} at most\n"
+        f"the sender was {figures['behind_s'] * 1e3:.0f} ms late at most",
+        highlight=False,
+    )
+
+
 def print_bus(figures: dict[str, Any]) -> None:
     """Messages by size, and frames as JPEG and as pixels."""
     console = result_console()

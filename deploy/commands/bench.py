@@ -14,6 +14,7 @@ import tyro
 from fieldpose.deploy.benchmarks import tables
 from fieldpose.deploy.benchmarks.isa import Isa, limited_to
 from fieldpose.deploy.commands.bench_mesh import Mesh
+from fieldpose.deploy.commands.bench_record import Record
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
 from fieldpose.deploy.scene import demo_file
 from fieldpose.errors import UsageError
@@ -290,6 +291,7 @@ class Options:
         | Annotated[Train, tyro.conf.subcommand("train")]
         | Annotated[Match, tyro.conf.subcommand("match")]
         | Annotated[Bus, tyro.conf.subcommand("bus")]
+        | Annotated[Record, tyro.conf.subcommand("record")]
         | Annotated[Track, tyro.conf.subcommand("track")]
         | Annotated[Start, tyro.conf.subcommand("start")]
         | Annotated[Mesh, tyro.conf.subcommand("mesh")]

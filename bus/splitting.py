@@ -191,9 +191,12 @@ def _read_expected(values: Mapping[str, str]) -> dict[tuple[str, str], int]:
 
 
 def _begun_with(path: Path) -> dict[str, dict[str, str]]:
-    """The metadata at the beginning of an unfinished part."""
+    """The metadata at the beginning of an unfinished file; none where there is none, or nothing yet in it."""
     partial = partial_path(path)
     aside = partial.with_name(f"{partial.name}.before")
-    salvage = Salvage(aside if aside.exists() else partial)
+    begun = [file for file in (aside, partial) if file.exists() and file.stat().st_size > 0]
+    if not begun:
+        return {}
+    salvage = Salvage(begun[0])
     next(salvage.payloads(), None)
     return dict(salvage.metadata)

@@ -243,7 +243,7 @@ def _folder(kept: Path | None) -> Iterator[Path]:
             raise OutputError(f"{kept}: no folder for logs can be made there: {error.strerror}") from error
         if not os.access(kept, os.W_OK):
             raise OutputError(f"{kept}: no right to write logs there")
-        yield kept
+        yield kept.resolve()
         return
     folder = Path(tempfile.mkdtemp(prefix="fieldpose-"))
     try:

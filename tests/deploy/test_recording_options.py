@@ -8,6 +8,7 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from support import bus_samples
@@ -111,6 +112,16 @@ def test_both_forms_are_recorded_at_once(tmp_path: Path) -> None:
     assert counts[0] == counts[1]
     assert counts[0]["/camera/image"] == 3
     assert info(foxglove).lossless
+
+
+@pytest.mark.parametrize("form", ["fieldpose", "foxglove"])
+def test_a_recorder_that_may_go_on_begins_where_there_is_nothing_yet(tmp_path: Path, form: Any) -> None:
+    bus = MemoryBus()
+    path = tmp_path / "run.mcap"
+    recorder = Recorder(bus, ADDRESS, RecordingOptions(format=form).store(path, ADDRESS, resume=True, from_start=True))
+    publish_everything(bus)
+    assert recorder.close()
+    assert info(path).lossless
 
 
 def write_everything(writer: FoxgloveRecording, numbers: range) -> None:

@@ -7,7 +7,7 @@ import os
 import struct
 import threading
 import time
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -150,6 +150,12 @@ def recorded_at(path: Path | str, topic: Topic[Any], key: str, log_time_ns: int)
                 raise RecordingError(f"{path}: a message on {key} cannot be read: {error}") from error
 
 
+def sources_in(path: Path | str) -> list[SourceInfo]:
+    """What a recording says of each sender, without reading its messages. Raises RecordingError as `info` does."""
+    with _reader(path) as reader:
+        return [_source_info(record.metadata) for record in reader.iter_metadata() if record.name == SOURCE_RECORD]
+
+
 def info(path: Path | str) -> RecordingInfo:
     """What a recording holds. Raises RecordingError for a file that is no whole recording."""
     times: dict[str, list[int]] = {}
@@ -173,51 +179,6 @@ def info(path: Path | str) -> RecordingInfo:
         metadata=named,
         attachments=attachments,
     )
-
-
-def counts_of(path: Path | str) -> tuple[list[SourceInfo], bool]:
-    """What a recording says of each sender, and whether it is lossless, without reading its messages.
-
-    Raises RecordingError for a file that is no whole recording.
-    """
-    with _reader(path) as reader:
-        metadata = [(record.name, record.metadata) for record in reader.iter_metadata()]
-    sources = [_source_info(values) for name, values in metadata if name == SOURCE_RECORD]
-    return sources, dict(metadata).get(RECORDING_RECORD, {}).get("lossless") == "true"
-
-
-def joined(parts: Sequence[RecordingInfo]) -> RecordingInfo | None:
-    """What the parts of a recording hold together, under the name of the last; None without any."""
-    if not parts:
-        return None
-    topics: dict[str, list[TopicInfo]] = {}
-    sources: dict[tuple[str, str], list[SourceInfo]] = {}
-    for part in parts:
-        for topic in part.topics:
-            topics.setdefault(topic.key, []).append(topic)
-        for source in part.sources:
-            sources.setdefault((source.key, source.source), []).append(source)
-    return replace(
-        parts[-1],
-        size_bytes=sum(part.size_bytes for part in parts),
-        messages=sum(part.messages for part in parts),
-        first_ns=min((part.first_ns for part in parts if part.messages), default=0),
-        last_ns=max(part.last_ns for part in parts),
-        lossless=all(part.lossless for part in parts),
-        topics=[_joined_topic(those) for _, those in sorted(topics.items())],
-        sources=[_joined_source(those) for _, those in sorted(sources.items())],
-    )
-
-
-def _joined_topic(parts: Sequence[TopicInfo]) -> TopicInfo:
-    messages, first, last = sum(p.messages for p in parts), parts[0].first_ns, parts[-1].last_ns
-    rate_hz = (messages - 1) / ((last - first) / 1e9) if last > first else 0.0
-    return replace(parts[0], messages=messages, first_ns=first, last_ns=last, rate_hz=rate_hz)
-
-
-def _joined_source(parts: Sequence[SourceInfo]) -> SourceInfo:
-    counts = {name: sum(getattr(part, name) for part in parts) for name in ("received", "written", "missing")}
-    return replace(parts[0], **counts, last=parts[-1].last)
 
 
 def of_another_program(path: Path | str) -> str | None:

@@ -47,12 +47,13 @@ class RecordingOptions:
     when_lost: bool = True
     """Write a snapshot whenever tracking is lost, up to 20 in a run."""
 
-    def check(self, record: Path | None, pipelines: int = 1) -> None:
+    def check(self, record: Path | None, pipelines: int = 1, attached: int = 0) -> None:
         """Raise UsageError and RecordingError for what could not be recorded so.
 
-        pipelines: how many are recorded, 0 where that is open.
+        pipelines: how many are recorded, 0 where that is open; attached: bytes that each part holds besides messages.
         """
         self.check_form(record, pipelines)
+        self._check_room(attached)
         for path in self.files(record):
             _check_way(path, self.split is not None)
 
@@ -117,12 +118,7 @@ class RecordingOptions:
             return None
         attached = list(attachments)
         split = self.parts()
-        held = sum(len(attachment.data) for attachment in attached)
-        if split is not None and split.max_bytes is not None and 2 * held > split.max_bytes:
-            raise UsageError(
-                f"split {self.split!r}: each part also holds {held / 1e6:.0f} MB of settings and field; make it"
-                f" {2 * held / 1e6 + 1:.0f}MB or more"
-            )
+        self._check_room(sum(len(attachment.data) for attachment in attached))
         openers: list[OpenPart] = []
         if self.format != "foxglove":
             openers.append(native_parts(metadata, attached, from_start))
@@ -144,6 +140,14 @@ class RecordingOptions:
         words += [] if self.split is None else [f"--{prefix}split", self.split]
         words += [] if self.snapshots is None else [f"--{prefix}snapshots", str(self.snapshots.resolve())]
         return [*words, f"--{prefix}{'' if self.when_lost else 'no-'}when-lost"]
+
+    def _check_room(self, attached: int) -> None:
+        split = self.parts()
+        if split is not None and split.max_bytes is not None and 2 * attached > split.max_bytes:
+            raise UsageError(
+                f"split {self.split!r}: each part also holds {attached / 1e6:.0f} MB of settings and field; make it"
+                f" {2 * attached / 1e6 + 1:.0f}MB or more"
+            )
 
     def _ring_bytes(self) -> int:
         found = _measured(self.ring_size, _BYTES)

@@ -18,7 +18,7 @@ import msgspec
 import psutil
 
 from fieldpose.bus.recorder import NAME
-from fieldpose.bus.replay import SourceInfo, counts_of
+from fieldpose.bus.replay import SourceInfo, sources_in
 from fieldpose.bus.topics import Address, topic_of
 from fieldpose.bus.transport import wait_for
 from fieldpose.deploy.benchmarks import echo, machine
@@ -74,14 +74,11 @@ class _Account:
     def __init__(self, record: Path) -> None:
         self._record, self._sources = record, list[SourceInfo]()
         self._parts = self._bytes = 0
-        self._lossless = True
 
     def take(self) -> None:
         """Count the parts that are finished, and remove them."""
         for path in recorded_files(self._record, split=True):
-            sources, lossless = counts_of(path)
-            self._sources += sources
-            self._lossless = self._lossless and lossless
+            self._sources += sources_in(path)
             self._parts += 1
             self._bytes += path.stat().st_size
             path.unlink()
@@ -100,7 +97,6 @@ class _Account:
             "lost_by_topic": {name: count for name, count in lost.items() if count},
             "missing_by_sequence": sum(source.missing for source in self._sources),
             "unwritten": sum(source.received - source.written for source in self._sources),
-            "lossless": self._lossless,
             "parts": self._parts,
             "mb_per_s": self._bytes / 1e6 / sent.seconds,
         }

@@ -20,7 +20,7 @@ class Record:
 
     Parts of the recording are counted and removed once they are finished. The JSON file has: machine, seconds, behind_s
     (the most that the sender was late), sent and written (messages), lost (their difference), lost_by_topic,
-    missing_by_sequence and unwritten (by the recorder's own account), lossless, parts, mb_per_s, cpu_share (of one
+    missing_by_sequence and unwritten (by the recorder's own account), parts, mb_per_s, cpu_share (of one
     core), rss_mb (before, highest, after_a_tenth of the time, end).
     """
 

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Literal
 
 from fieldpose.bus.messages import State
-from fieldpose.bus.replay import RecordingInfo, info, joined
+from fieldpose.bus.parts_info import joined
+from fieldpose.bus.replay import RecordingInfo, info
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address, shared_address
 from fieldpose.bus.transport import ZenohBus
@@ -96,7 +97,8 @@ def run_pipelines(run: Run, report: Report = lambda progress: None) -> list[RunR
     RecordingError for a recording that is in the way. One that could not be finished is told of in the results: for
     want of a disk nothing stops tracking.
     """
-    run.recording.check(run.record, len(run.plans))
+    fields = {plan.field for plan in run.plans if plan.field is not None}
+    run.recording.check(run.record, len(run.plans), sum(field.stat().st_size for field in fields))
     check_free(run.listen)
     with StopSignals() as signals, _folder(run.logs) as folder:
         hub = run.listen or f"tcp/127.0.0.1:{free_port()}"
@@ -116,6 +118,7 @@ class _Running:
         self._stop = signals.stop
         self._report = report
         self._limit = _RESTARTS_AT_START
+        self._spared: tuple[str, ...] = ()
         self._pids: dict[str, int] = {}
 
     def run(self) -> list[RunResult]:
@@ -177,6 +180,8 @@ class _Running:
             self._stop.wait(_POLL_S)
         watching.close()
         self._limit = _RESTARTS
+        # From here on the end of a recording is no reason to stop tracking.
+        self._spared = (RECORDER,)
         return time.monotonic()
 
     def _watch(self) -> bool:
@@ -192,7 +197,7 @@ class _Running:
         """Take in what has come and check on the processes; returns whether all cameras have finished."""
         for collector in self._collectors:
             collector.update()
-        processes = self._supervisor.check(self._limit)
+        processes = self._supervisor.check(self._limit, self._spared)
         self._pids = {name: process.pid for name, process in processes.items() if process.pid}
         ended = [name in processes and processes[name].finished for name in self._cameras]
         return bool(ended) and all(ended)

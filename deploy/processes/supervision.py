@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import xmlrpc.client
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from http.client import HTTPException
@@ -133,11 +133,14 @@ class Supervisor:
         """Whether a process has been started, as far as `poll` has told."""
         return self._pids.get(name, 0) > 0
 
-    def check(self, restart_limit: int) -> dict[str, ProcessInfo]:
-        """`poll`, raising ProcessError with the last line of its log for a process that does not stay up."""
+    def check(self, restart_limit: int, spared: Container[str] = ()) -> dict[str, ProcessInfo]:
+        """`poll`, raising ProcessError with the last line of its log for a process that does not stay up.
+
+        spared: those without which the others go on.
+        """
         infos = self.poll()
         for name, info in infos.items():
-            if info.given_up or self.restarts.get(name, 0) > restart_limit:
+            if name not in spared and (info.given_up or self.restarts.get(name, 0) > restart_limit):
                 raise ProcessError(self._why(name, info))
         return infos
 

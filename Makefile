@@ -49,6 +49,7 @@ bench: $(INSTALLED)
 	$(BIN)/fieldpose bench render --json out/bench/render.json
 	$(BIN)/fieldpose bench match --json out/bench/match.json
 	$(BIN)/fieldpose bench bus --json out/bench/bus.json
+	$(BIN)/fieldpose bench record --json out/bench/record.json
 	$(BIN)/fieldpose bench track --json out/bench/track.json
 
 clean:

@@ -22,7 +22,8 @@ NAME = "recorder"
 T = TypeVar("T")
 
 RECORDED: tuple[Topic[Any], ...] = tuple(topic for topic in ALL if topic.recorded)
-QUEUE_BYTES = 256 << 20
+QUEUE_BYTES = 512 << 20
+"""Five seconds of raw frames and views at full rate, for when a disk stalls."""
 _CHANNEL_CAPACITY = 64
 
 

@@ -62,7 +62,7 @@ class SplitWriter:
         self._path, self._split, self._open = path, split, open_part
         self._finished = 0
         self._lossless = True
-        self._closing: threading.Thread | None = None
+        self._closing: list[threading.Thread] = []
         self._failure: OSError | None = None
         self._began_ns: int | None = None
         self._number, self._part = self._first(resume)
@@ -90,8 +90,8 @@ class SplitWriter:
         return self._part.close() and self._lossless
 
     def end_early(self, error: OSError) -> RecordingError:
-        if self._closing is not None:
-            self._closing.join()
+        for thread in self._closing:
+            thread.join()
         return self._part.end_early(error)
 
     def _is_full(self, now_ns: int) -> bool:
@@ -103,7 +103,7 @@ class SplitWriter:
 
     def _next(self) -> None:
         """Begin the next part before the one before is finished, so that a kill always leaves an unfinished one."""
-        self._wait()
+        self._check()
         before, number = self._part, self._number + 1
         try:
             self._part = self._open(part_path(self._path, number), number, before, False)
@@ -112,20 +112,26 @@ class SplitWriter:
             raise error.__cause__ if isinstance(error.__cause__, OSError) else OSError(str(error)) from error
         self._number, self._began_ns = number, None
         self._finished += before.messages
-        self._closing = threading.Thread(target=self._close, args=(before,), name="finish part")
-        self._closing.start()
+        # A disk may take longer for a part than the next one lasts: nothing waits for it.
+        thread = threading.Thread(target=self._close, args=(before,), name="finish part")
+        self._closing = [*(each for each in self._closing if each.is_alive()), thread]
+        thread.start()
 
     def _close(self, part: Part) -> None:
         try:
-            self._lossless = part.close() and self._lossless
+            if not part.close():
+                self._lossless = False
         except RecordingError as error:
             self._failure = OSError(str(error))
         except OSError as error:
             self._failure = OSError(str(part.end_early(error)))
 
     def _wait(self) -> None:
-        if self._closing is not None:
-            self._closing.join()
+        for thread in self._closing:
+            thread.join()
+        self._check()
+
+    def _check(self) -> None:
         if self._failure is not None:
             raise self._failure
 

@@ -38,7 +38,8 @@ def measure(
 ) -> dict[str, Any]:  # fmt: skip
     """Everything that `fieldpose bench record` prints, as its JSON.
 
-    Parts of the recording are counted and removed as soon as they are finished, so that the disk needs room for three.
+    Parts of the recording are counted and removed as soon as they are finished, so that the disk needs room for
+    few.
     Raises TransportError, ProcessError and RecordingError.
     """
     folder.mkdir(parents=True, exist_ok=True)

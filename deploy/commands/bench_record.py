@@ -33,7 +33,7 @@ class Record:
     height: int = 480
     """Of frames and views, in pixels."""
     split: str = "1GB"
-    """How large parts are; the disk needs room for three."""
+    """How large parts are; the disk needs room for some of them."""
     out: Path = Path("out/bench")
     """Folder to record in."""
     json: Path | None = None

@@ -59,6 +59,7 @@ def test_a_users_mistake_is_told_at_once_and_not_tried_again(tmp_path: Path) -> 
         until(lambda: supervisor.poll()["a"].given_up)
         with pytest.raises(ProcessError, match=r"^a: no such thing$"):
             supervisor.check(restart_limit=2)
+        assert supervisor.check(restart_limit=2, spared=("a",))["a"].given_up
         assert supervisor.restarts == {}
 
 

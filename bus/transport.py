@@ -1,12 +1,10 @@
-"""The bus between processes and hosts, over Zenoh, which only this module, `questions` and `ros2` know."""
+"""The bus between processes and hosts, over Zenoh, which only this module and `questions`, `refusals`, `ros2` know."""
 
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -14,6 +12,7 @@ from typing import Any
 
 import zenoh
 
+from fieldpose.bus.access import Access, Deed
 from fieldpose.bus.memory import MemoryBus
 from fieldpose.bus.presence import Presence
 from fieldpose.bus.protocol import Answer, Bus, Closer, Closing, Replies, Sink, Watcher, nobody_answers, wait_for
@@ -23,8 +22,7 @@ from fieldpose.bus.topics import Topic
 from fieldpose.errors import TransportError
 
 __all__ = [
-    "LOCAL_HUB", "Bus", "Closing", "MemoryBus", "Sink", "Watcher", "ZenohBus", "log_to_stderr", "serve_hub",
-    "wait_for",
+    "LOCAL_HUB", "Bus", "Closing", "MemoryBus", "Sink", "Watcher", "ZenohBus", "serve_hub", "wait_for",
 ]  # fmt: skip
 
 LOCAL_HUB = "tcp/127.0.0.1:7447"
@@ -46,14 +44,16 @@ class ZenohBus:
     """A bus over Zenoh: a peer that finds the others through the hub, and returns by itself after the hub's death.
 
     `hub` and `listen` are endpoints ("tcp/host:port", "tls/host:port"); `settings` adds to Zenoh's configuration by
-    path, for instance {"transport/auth/usrpwd/user": "..."}. Raises TransportError where these cannot be used; a
-    hub that is not there yet is no error, see `wait_for_hub`.
+    path. access: of a bus that is closed, whose endpoints are all of TLS; without it everybody is let in who reaches
+    the address. Raises TransportError where these cannot be used; a hub that is not there yet is no error, see
+    `wait_for_hub`.
     """
 
     def __init__(
-        self, hub: str = LOCAL_HUB, listen: str = _LOCAL_PEER, settings: Mapping[str, Any] | None = None
-    ) -> None:
-        self._hub = checked_endpoint(hub)
+        self, hub: str = LOCAL_HUB, listen: str = _LOCAL_PEER, settings: Mapping[str, Any] | None = None,
+        access: Access | None = None,
+    ) -> None:  # fmt: skip
+        self._hub, self._access = checked_endpoint(hub), access
         peer = {
             "mode": "peer",
             "connect/endpoints": [self._hub],
@@ -64,7 +64,8 @@ class ZenohBus:
             "transport/shared_memory/transport_optimization/pool_size": _POOL_BYTES,
             "transport/shared_memory/transport_optimization/enabled": _shared_memory_fits(),
         }
-        self._session = open_session({**peer, **(settings or {})}, f"cannot use hub {hub} and listen on {listen}")
+        what = f"cannot use hub {hub} and listen on {listen}"
+        self._session = open_session({**peer, **closing(access), **(settings or {})}, what)
         self._publishers: dict[str, Any] = {}
         self._declaring = threading.Lock()
         self._mine: list[Closer] = []
@@ -85,6 +86,7 @@ class ZenohBus:
             with self._declaring:
                 publisher = self._publishers.get(key)
                 if publisher is None:
+                    self._check("send on", key)
                     priority = _PRIORITIES[topic.priority] if topic is not None else zenoh.Priority.DATA
                     publisher = self._session.declare_publisher(key, priority=priority, congestion_control=_CONGESTION)
                     self._publishers[key] = publisher
@@ -93,6 +95,7 @@ class ZenohBus:
             raise TransportError(f"cannot send on {key}: {zenoh_reason(error)}") from error
 
     def subscribe(self, key: str, sink: Sink, capacity: int) -> Closing:
+        self._check("listen to", key)
         channel: Any = zenoh.handlers.RingChannel(1) if capacity == 1 else zenoh.handlers.FifoChannel(capacity)
         subscriber = self._session.declare_subscriber(key, channel)
         # Zenoh's channel keeps the newest while Python is busy; copying out at once frees shared memory.
@@ -106,6 +109,7 @@ class ZenohBus:
         return self._closer(end)
 
     def serve(self, key: str, answer: Answer) -> Closing:
+        self._check("answer at", key)
         # A ring: where Python is kept from running, a full channel must not hold up what else comes over the link.
         queryable = self._session.declare_queryable(key, zenoh.handlers.RingChannel(_QUESTIONS))
         thread = threading.Thread(
@@ -120,6 +124,7 @@ class ZenohBus:
         return self._closer(end)
 
     def ask(self, key: str, payload: bytes, timeout_s: float) -> Replies:
+        self._check("ask at", key)
         deadline = time.monotonic() + timeout_s
         while True:
             try:
@@ -177,6 +182,10 @@ class ZenohBus:
         self._mine.append(Closer(events.undeclare))
         return presence
 
+    def _check(self, deed: Deed, key: str) -> None:
+        if self._access is not None:
+            self._access.check(deed, key)
+
     def _closer(self, action: Callable[[], None]) -> Closing:
         closer = Closer(action)
         self._mine.append(closer)
@@ -196,32 +205,21 @@ def feed(channel: Any, sink: Sink) -> None:
 
 
 def serve_hub(
-    listen: str = LOCAL_HUB, settings: Mapping[str, Any] | None = None, stop: threading.Event | None = None
-) -> None:
+    listen: str = LOCAL_HUB, settings: Mapping[str, Any] | None = None, stop: threading.Event | None = None,
+    access: Access | None = None,
+) -> None:  # fmt: skip
     """Be the meeting point of all processes until SIGTERM, SIGINT or `stop`.
 
-    Raises TransportError where it cannot listen, as on a port in use.
+    access: as of `ZenohBus`. Raises TransportError where it cannot listen, as on a port in use.
     """
     router = {"mode": "router", "listen/endpoints": [checked_endpoint(listen)]}
     what = f"no hub at {listen}: is another one running there, or another program? Choose a free port"
     with StopSignals(stop) as signals:
-        session = open_session({**router, **(settings or {})}, what)
+        session = open_session({**router, **closing(access), **(settings or {})}, what)
         try:
             signals.stop.wait()
         finally:
             session.close()
-
-
-def log_to_stderr(level: str = "error") -> None:
-    """Turn on Zenoh's log, the only place that tells why a connection was refused, on stderr.
-
-    Zenoh writes it to the process's standard output: that descriptor becomes stderr's, while `sys.stdout` keeps a
-    copy of the old one. To be called once, by a process of our own and before it prints.
-    """
-    sys.stdout.flush()
-    sys.stdout = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)
-    zenoh.init_log_from_env_or(level)
 
 
 def open_session(values: Mapping[str, Any], what: str) -> Any:
@@ -242,6 +240,11 @@ def open_session(values: Mapping[str, Any], what: str) -> Any:
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise TransportError(f"{what}: {zenoh_reason(error)}") from error
+
+
+def closing(access: Access | None) -> dict[str, Any]:
+    """Settings that keep out who is not of a closed bus; none where it is open."""
+    return {} if access is None else access.settings()
 
 
 def checked_endpoint(text: str) -> str:

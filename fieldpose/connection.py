@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 from types import TracebackType
 
 import numpy as np
@@ -13,8 +14,9 @@ from fieldpose.bus.messages import CameraOrigin, Encoding, Prior, State
 from fieldpose.bus.ports import Inbox, Outbox, first_header
 from fieldpose.bus.requests import ControlValues, Request, Reset, SetGuess, SetSolving, Show
 from fieldpose.bus.topics import PRIOR, STATE, Address
-from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
-from fieldpose.deploy.processes.endpoints import peer_address
+from fieldpose.bus.transport import LOCAL_HUB
+from fieldpose.deploy.access.joining import NO_ENTRY, Entry, join
+from fieldpose.deploy.access.roles import PROGRAM
 from fieldpose.errors import ConfigError, GeometryError
 from fieldpose.stages.camera.wire import frame_messages
 from fieldpose.stages.geometry import RIGID_TOLERANCE, Camera, is_rigid
@@ -25,12 +27,16 @@ _KEPT_STATES = 1024
 
 
 class Connection:
-    """One pipeline, an (object, camera) pair at a site, on the bus of a hub. Raises FieldposeError without a hub."""
+    """One pipeline, an (object, camera) pair at a site, on the bus of a hub. Raises FieldposeError without a hub.
 
-    def __init__(self, hub: str, address: Address, timeout_s: float) -> None:
-        self._bus, self._address = ZenohBus(hub, peer_address(hub)), address
+    entry: by what it is let in; roles: in the first of which there are keys of.
+    """
+
+    def __init__(
+        self, hub: str, address: Address, timeout_s: float, entry: Entry = NO_ENTRY, roles: Sequence[str] = (PROGRAM,)
+    ) -> None:
+        self._bus, self._address = join(hub, entry, roles, timeout_s), address
         try:
-            self._bus.wait_for_hub(timeout_s)
             self._states = Inbox(self._bus, address, (STATE,), {STATE: _KEPT_STATES})
             self._bus.settle(timeout_s, images=True)
         except BaseException:
@@ -121,10 +127,15 @@ class Connection:
 
 def connect(
     hub: str = LOCAL_HUB, object: str = "object", camera: str = "camera0", site: str = "fieldpose",
-    timeout_s: float = 10.0,
+    timeout_s: float = 10.0, tls: str | Path | None = None, role: str = PROGRAM, open: bool = False,
 ) -> Connection:  # fmt: skip
     """Join the bus of a pipeline whose hub listens at `hub` (`fieldpose run … --listen`, or `fieldpose stage hub`).
 
-    Raises FieldposeError where no hub answers within `timeout_s`.
+    A run of this user on this machine needs no more. tls: the folder of certificates of `fieldpose certs`, of which
+    that of `role` is taken: program (all that a Connection can do), camera (only `publish`), prior (only
+    `publish_prior`), operator (only requests) or viewer. open: of a hub that lets everybody in.
+
+    Raises FieldposeError where no hub answers within `timeout_s`, or where it refuses, and why.
     """
-    return Connection(hub, Address(site, object, camera), timeout_s)
+    entry = Entry(None if tls is None else Path(tls), open)
+    return Connection(hub, Address(site, object, camera), timeout_s, entry, (role,))

@@ -11,10 +11,11 @@ import tyro
 
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address
-from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
+from fieldpose.bus.transport import LOCAL_HUB
+from fieldpose.deploy.access.joining import Entry, join
+from fieldpose.deploy.access.roles import VIEWER
 from fieldpose.deploy.foxglove.extra import check_extra
 from fieldpose.deploy.foxglove.layouts import layout
-from fieldpose.deploy.processes.endpoints import peer_address
 from fieldpose.deploy.reporting.output import check_writable, write_bytes
 from fieldpose.errors import UsageError
 
@@ -44,6 +45,7 @@ class Foxglove:
     layout: Path | None = None
     """Write the layout that shows everything into this file (.json), to be imported in Foxglove. What it draws has the
     right size for cameras about 4 units away; the layout that `fieldpose export` writes fits its recording."""
+    entry: Annotated[Entry, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Entry)
     address: Annotated[Address, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Address)
     """Which pipeline."""
 
@@ -52,9 +54,8 @@ class Foxglove:
         self._check()
         from fieldpose.deploy.foxglove.serving import Bridge, Server
 
-        bus = ZenohBus(self.connect, peer_address(self.connect))
+        bus = join(self.connect, self.entry, (VIEWER,), _HUB_S)
         try:
-            bus.wait_for_hub(_HUB_S)
             with Server(self.host, self.port, f"fieldpose {self.address.pair}") as server, StopSignals() as signals:
                 if self.layout is not None:
                     self._write_layout(self.layout)

@@ -12,10 +12,10 @@ import tyro
 from fieldpose.bus.ros2 import Keys, RosNames, RosNode
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address
-from fieldpose.bus.transport import ZenohBus
+from fieldpose.deploy.access.joining import Entry, join
+from fieldpose.deploy.access.roles import PROGRAM
 from fieldpose.deploy.bridges.ros2 import RosBridge, RosTopics
 from fieldpose.deploy.bridges.ros_messages import Distro, Frames, RosMessages, topics_in_words
-from fieldpose.deploy.processes.endpoints import peer_address
 from fieldpose.errors import ConfigError, UsageError
 
 _HUB_S = 5.0
@@ -53,6 +53,7 @@ class Ros2:
     """That length instead of the field's; 1 where neither is given."""
     frames: Frames = dataclasses.field(default_factory=Frames)
     topics: RosTopics = dataclasses.field(default_factory=RosTopics)
+    entry: Annotated[Entry, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Entry)
     address: Annotated[Address, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Address)
     """Which pipeline."""
 
@@ -67,9 +68,8 @@ class Ros2:
         messages = RosMessages(self.frames, metres, self.distro)
         names = RosNames(self.domain, self.namespace, self.node, self.keys)
         with StopSignals() as signals:
-            bus = ZenohBus(self.connect, peer_address(self.connect))
+            bus = join(self.connect, self.entry, (PROGRAM,), _HUB_S)
             try:
-                bus.wait_for_hub(_HUB_S)
                 node = RosNode(self.router, names)
                 try:
                     bridge = RosBridge(bus, self.address, node, names, self.topics, messages)

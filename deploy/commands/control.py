@@ -13,8 +13,9 @@ import tyro
 from fieldpose.bus.control import ask_stage
 from fieldpose.bus.requests import MOST_SOLVES_PER_S, ControlValues, Request, Reset, SetGuess, SetSolving, Show
 from fieldpose.bus.topics import Address
-from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
-from fieldpose.deploy.processes.endpoints import peer_address
+from fieldpose.bus.transport import LOCAL_HUB
+from fieldpose.deploy.access.joining import Entry, joined
+from fieldpose.deploy.access.roles import OPERATOR
 from fieldpose.errors import ConfigError, RefusedError, UsageError
 from fieldpose.stages.tracking.beginning import beginning
 
@@ -44,19 +45,16 @@ class Options:
     """The field (.safetensors) that has the training view."""
     timeout_s: float = 5.0
     """How long to wait for an answer."""
+    entry: Annotated[Entry, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Entry)
     address: Annotated[Address, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Address)
     """Which pipelines: a part may be "*"."""
 
     def run(self) -> int:
         """Ask, and print what is answered. Raises RefusedError, and TransportError where nobody answers."""
         request = self.request()
-        bus = ZenohBus(self.connect, peer_address(self.connect))
-        try:
-            bus.wait_for_hub(_HUB_S)
+        with joined(self.connect, self.entry, (OPERATOR,), _HUB_S) as bus:
             bus.settle(_HUB_S)  # or some of several pipelines might not be known yet
             values, refusals = ask_stage(bus, self.address, _TRACKING, request, self.timeout_s)
-        finally:
-            bus.close()
         for key, each in values.items():
             print(f"{key}: {in_words(each)}")
         if refusals:

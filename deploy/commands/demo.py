@@ -13,6 +13,7 @@ import tyro
 from rich.progress import Progress
 
 from fieldpose.bus.replay import info
+from fieldpose.deploy.access.joining import NO_ENTRY
 from fieldpose.deploy.commands.run import INTERRUPTED, check_recorded, draw, planned
 from fieldpose.deploy.processes.pipeline import Run, run_pipelines
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_bytes, write_json
@@ -59,7 +60,7 @@ class Options:
         camera = replace(self.settings.camera, source=f"mcap:{sequence}")
         _remove_earlier(recording, sequence.name)
         plan = planned(replace(self.settings, camera=camera), field)
-        with page_beside((plan,), None, self.view) as hub, live_line("demo") as report:
+        with page_beside((plan,), None, self.view, NO_ENTRY) as hub, live_line("demo") as report:
             (outcome,) = run_pipelines(Run((plan,), recording, hub, self.logs), report)
         written = [recording, self.out / "summary.json"]
         summary = summarise(outcome)

@@ -15,8 +15,10 @@ from fieldpose.bus.recorder import NAME, Recorder
 from fieldpose.bus.requests import SaveSnapshot
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address
-from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
-from fieldpose.deploy.processes.endpoints import peer_address
+from fieldpose.bus.transport import LOCAL_HUB
+from fieldpose.deploy.access.joining import Entry, joined
+from fieldpose.deploy.access.roles import OPERATOR
+from fieldpose.deploy.graph import RECORDER
 from fieldpose.deploy.recording_options import RecordingOptions, seconds_of
 from fieldpose.deploy.reporting.output import check_writable, progress_console
 from fieldpose.errors import RefusedError, UsageError
@@ -50,6 +52,7 @@ class Options:
     snapshot: str | None = None
     """Ask for what came in this time, as 10s, and record nothing."""
     options: Annotated[RecordingOptions, tyro.conf.arg(name="")] = dataclasses.field(default_factory=RecordingOptions)
+    entry: Annotated[Entry, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Entry)
     address: Annotated[Address, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=lambda: Address(object="*", camera="*")
     )
@@ -64,16 +67,12 @@ class Options:
         one = "*" not in (self.address.object, self.address.camera)
         self.options.check(self.recording, pipelines=1 if one else 0)
         check_writable(*self.options.files(self.recording))
-        bus = ZenohBus(self.connect, peer_address(self.connect))
-        try:
-            bus.wait_for_hub(_HUB_S)
+        with joined(self.connect, self.entry, (RECORDER,), _HUB_S) as bus:
             recorder = Recorder(
                 bus, self.address, self.options.store(self.recording, self.address), self.options.keep()
             )
             self._wait(recorder)
             lossless = recorder.close()
-        finally:
-            bus.close()
         self._tell(recorder, lossless)
         return 0
 
@@ -97,13 +96,9 @@ class Options:
     def _ask(self, seconds: float) -> int:
         if self.recording is not None or self.options != RecordingOptions():
             raise UsageError("--snapshot asks a recorder that is running; leave out what tells how to record")
-        bus = ZenohBus(self.connect, peer_address(self.connect))
-        try:
-            bus.wait_for_hub(_HUB_S)
+        with joined(self.connect, self.entry, (OPERATOR,), _HUB_S) as bus:
             bus.settle(_HUB_S)
             saved, refusals = ask_stage(bus, self.address, NAME, SaveSnapshot(seconds=seconds), _SAVED_S)
-        finally:
-            bus.close()
         for answer in saved.values():
             print(f"{answer.path}: {answer.messages} messages of the last {answer.seconds:.1f} s")
         if refusals:

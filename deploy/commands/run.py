@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from fieldpose.deploy.access.joining import Entry
 from fieldpose.deploy.plan import Plan, resolve
 from fieldpose.deploy.processes.pipeline import Run, run_pipelines
 from fieldpose.deploy.recording_options import RecordingOptions
@@ -98,7 +99,9 @@ class Options:
     view: bool = False
     """Serve a page that shows the run while it lasts, and print its address; see `fieldpose view`."""
     listen: str | None = None
-    """Address of the hub, for instance tcp/0.0.0.0:7447 (default: a free port of this machine)."""
+    """Address of the hub, for instance tcp/0.0.0.0:7447 (default: a free port of this machine); where other hosts reach
+    it, --tls or --open is needed too."""
+    entry: Annotated[Entry, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Entry)
     logs: Path | None = None
     """Keep the logs of the processes in this folder."""
     config: Path | None = None
@@ -127,8 +130,8 @@ class Options:
             file.check()
         named = titles[0] if len(plans) == 1 else f"{len(plans)} pipelines"
         with _recording_for(self.report, self.record) as recording:
-            with page_beside(plans, self.listen, self.view) as hub, live_line(named) as report:
-                outcomes = run_pipelines(Run(plans, recording, hub, self.logs, self.recording), report)
+            with page_beside(plans, self.listen, self.view, self.entry) as hub, live_line(named) as report:
+                outcomes = run_pipelines(Run(plans, recording, hub, self.logs, self.recording, self.entry), report)
             self._write(plans, titles, outcomes)
             for plan, outcome, file in zip(plans, outcomes, files, strict=True):
                 for line in file.write(Trajectory(plan.settings.address, _unit(plan), outcome.frames)):

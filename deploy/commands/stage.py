@@ -14,12 +14,15 @@ import tyro
 
 from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.node import Handler, run_nodes
-from fieldpose.bus.transport import LOCAL_HUB, ZenohBus, log_to_stderr, serve_hub, wait_for
+from fieldpose.bus.refusals import log_to_stderr
+from fieldpose.bus.transport import LOCAL_HUB, serve_hub, wait_for
+from fieldpose.deploy.access.joining import Entry, access_as, check_open, hub_keys, joint
 from fieldpose.deploy.graph import (
     AT_WORK,
     BY_NAME,
     CAMERA,
     GRAPH,
+    HUB,
     RECORDER,
     STAGES,
     Launch,
@@ -29,7 +32,6 @@ from fieldpose.deploy.graph import (
 )  # fmt: skip
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan, resolve
-from fieldpose.deploy.processes.endpoints import peer_address
 from fieldpose.deploy.processes.lifeline import die_with_parent
 from fieldpose.deploy.processes.preload import field_of, pipelines_of
 from fieldpose.deploy.processes.threads import hold_to
@@ -82,6 +84,7 @@ class Options:
     wait_for: tuple[str, ...] | None = None
     """Processes that must be ready before this one begins, those of other pipelines as OBJECT/CAMERA/PROCESS (default:
     none, and for the camera, which sends nothing before they are, all that its frames pass)."""
+    entry: Annotated[Entry, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Entry)
     config: Path | None = None
     """TOML or JSON file of settings."""
     settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Settings)
@@ -91,17 +94,23 @@ class Options:
         supervised = "SUPERVISOR_ENABLED" in os.environ
         if supervised:
             die_with_parent()
-        log_to_stderr()
         row = BY_NAME[self.name]
+        log = log_to_stderr(roles=row.make is None, say=stage_logger(row.name).warning)
         if row.make is None:
-            serve_hub(self.listen or self.connect)
+            _serve_hub(self.listen or self.connect, self.entry)
         else:
             _serve(self, row, row.make)
         if supervised:
             # Everything is closed, and Python would take two seconds to take the numeric libraries apart.
+            log.close()
             sys.stderr.flush()
             os._exit(0)
         return 0
+
+
+def _serve_hub(listen: str, entry: Entry) -> None:
+    with hub_keys(listen, entry) as (at, keys):
+        serve_hub(at, access=None if keys is None else access_as(keys, HUB))
 
 
 def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handler]) -> None:
@@ -115,7 +124,10 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     awaited = options.wait_for if options.wait_for is not None else _passed(plans[0]) if row.name == CAMERA else ()
     if row.solves and any(plan.follows for plan in plans):
         os.nice(_GIVES_WAY)
-    bus = ZenohBus(options.connect, options.listen or peer_address(options.connect))
+    way = joint(options.connect, options.entry, (row.name,))
+    if options.listen is not None and way.access is None:
+        check_open(options.listen, options.entry)
+    bus = way.session(options.listen)
     for plan in plans:
         _tell(plan, row)
 
@@ -130,7 +142,7 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
         # A recorder is one for all.
         those = each[:1] if row.name == RECORDER else each
         handlers = [(make(parts, launch), parts.settings.address) for parts in those]
-        bus.wait_for_hub(_START_S)
+        way.wait(bus, _START_S)
         wait_for(bus, address, first, _START_S)
         run_nodes(handlers, bus)
     finally:

@@ -20,8 +20,9 @@ from fieldpose.bus.messages import State
 from fieldpose.bus.ports import Inbox
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address
-from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
-from fieldpose.deploy.processes.endpoints import peer_address
+from fieldpose.bus.transport import LOCAL_HUB
+from fieldpose.deploy.access.joining import Entry, joined
+from fieldpose.deploy.access.roles import VIEWER
 from fieldpose.deploy.reporting.output import result_console
 from fieldpose.deploy.viewing.standing import HEARD, Heading, Row, Standing
 from fieldpose.errors import TransportError
@@ -58,6 +59,7 @@ class Options:
     """Where the hub is; `fieldpose run` says it when it starts."""
     once: bool = False
     """Print one table after a second, and end; so it is too where stdout is no terminal."""
+    entry: Annotated[Entry, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Entry)
     address: Annotated[Address, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=lambda: Address(object="*", camera="*")
     )
@@ -65,17 +67,12 @@ class Options:
 
     def run(self) -> int:
         """Show. Raises TransportError where no hub answers, and with --once where no process is heard of."""
-        bus = ZenohBus(self.connect, peer_address(self.connect))
-        try:
-            bus.wait_for_hub(_HUB_S)
+        with joined(self.connect, self.entry, (VIEWER,), _HUB_S) as bus, StopSignals() as signals:
             inbox = Inbox(bus, self.address, HEARD, dict.fromkeys(HEARD, _CAPACITY))
-            with StopSignals() as signals:
-                if self.once or not sys.stdout.isatty():
-                    self._print(inbox, signals)
-                else:
-                    _live(inbox, signals)
-        finally:
-            bus.close()
+            if self.once or not sys.stdout.isatty():
+                self._print(inbox, signals)
+            else:
+                _live(inbox, signals)
         return 0
 
     def _print(self, inbox: Inbox, signals: StopSignals) -> None:

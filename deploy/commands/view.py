@@ -18,9 +18,10 @@ from fieldpose.bus.ports import Inbox
 from fieldpose.bus.replay import info
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import FRAME, STATE, Address
-from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
+from fieldpose.bus.transport import LOCAL_HUB
 from fieldpose.connection import Connection
-from fieldpose.deploy.processes.endpoints import peer_address
+from fieldpose.deploy.access.joining import Entry, joined
+from fieldpose.deploy.access.roles import OPERATOR, VIEWER
 from fieldpose.deploy.reporting.provenance import pipelines_in, recorded_field
 from fieldpose.deploy.viewing.moments import WATCHED, Moment, Moments
 from fieldpose.deploy.viewing.recorded import RecordedMoments
@@ -66,6 +67,7 @@ class Options:
     """OBJECT/CAMERA: which pipeline of a recording, where it holds several."""
     seconds: float | None = None
     """Stop after this time."""
+    entry: Annotated[Entry, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Entry)
     address: Annotated[Address, tyro.conf.arg(name="")] = dataclasses.field(default_factory=Address)
     """Which pipeline."""
 
@@ -102,17 +104,13 @@ class Options:
 
     def _live(self) -> int:
         field = load_field(self.what)
-        bus = ZenohBus(self.connect, peer_address(self.connect))
-        try:
-            bus.wait_for_hub(_HUB_S)
+        with joined(self.connect, self.entry, (OPERATOR, VIEWER), _HUB_S) as bus:
             inbox = Inbox(
                 bus, self.address, WATCHED, {topic: _IMAGES if topic is FRAME else _QUEUED for topic in WATCHED}
             )
             page = self._page(field, self.address.pair, self._actions())
             self._say(page)
             return self._serve(page, _Live(inbox, page).update)
-        finally:
-            bus.close()
 
     def _page(self, field: Field, title: str, actions: Actions | None = None) -> Page:
         # It brings what serves pages, which takes a while.
@@ -127,7 +125,7 @@ class Options:
 
         def asked(do: Callable[[Connection], object]) -> str:
             try:
-                with Connection(self.connect, self.address, _ASK_S) as pipeline:
+                with Connection(self.connect, self.address, _ASK_S, self.entry, (OPERATOR, VIEWER)) as pipeline:
                     do(pipeline)
             except FieldposeError as error:
                 return f"not done: {error}"

@@ -10,8 +10,8 @@ import socket
 from fieldpose.errors import TransportError
 
 _TCP = re.compile(r"(?:tcp|tls|ws|wss)/(?P<host>[\w.:\[\]-]+):(?P<port>\d+)")
-_THIS_MACHINE = "tcp/127.0.0.1:0"
-_EVERYWHERE = "tcp/0.0.0.0:0"
+_THIS_MACHINE = "127.0.0.1:0"
+_EVERYWHERE = "0.0.0.0:0"
 
 
 def free_port() -> int:
@@ -39,8 +39,39 @@ def check_free(listen: str | None) -> None:
 
 def peer_address(hub: str) -> str:
     """Where a process listens for the others: on this machine alone if the hub is on it, else for every host."""
-    found = _TCP.fullmatch(hub)
-    return _THIS_MACHINE if found is None or _is_this_machine(found["host"]) else _EVERYWHERE
+    if _TCP.fullmatch(hub) is None:
+        return f"tcp/{_THIS_MACHINE}"
+    scheme = "tls" if hub.startswith("tls/") else "tcp"
+    return f"{scheme}/{_THIS_MACHINE if is_local(hub) else _EVERYWHERE}"
+
+
+def is_local(endpoint: str) -> bool:
+    """Whether an address can be reached from this machine alone."""
+    found = _TCP.fullmatch(endpoint)
+    return found is not None and _is_this_machine(found["host"])
+
+
+def with_scheme(endpoint: str, scheme: str) -> str:
+    """The same host and port by another protocol."""
+    found = _TCP.fullmatch(endpoint)
+    return endpoint if found is None else f"{scheme}/{found['host']}:{found['port']}"
+
+
+def host_of(endpoint: str) -> str:
+    """The host of an address. Raises TransportError for what is none."""
+    return _parts(endpoint)["host"].strip("[]")
+
+
+def port_of(endpoint: str) -> int:
+    """The port of an address. Raises TransportError for what is none."""
+    return int(_parts(endpoint)["port"])
+
+
+def _parts(endpoint: str) -> re.Match[str]:
+    found = _TCP.fullmatch(endpoint)
+    if found is None:
+        raise TransportError(f"{endpoint!r} is no address of a hub; expected for instance tcp/127.0.0.1:7447")
+    return found
 
 
 def _is_this_machine(host: str) -> bool:

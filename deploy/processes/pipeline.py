@@ -18,10 +18,11 @@ from fieldpose.bus.replay import RecordingInfo, info
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address, shared_address
 from fieldpose.bus.transport import ZenohBus
+from fieldpose.deploy.access.joining import Entry, Joint, access_as, hub_keys
 from fieldpose.deploy.graph import CAMERA, HUB, OBSERVER, RECORDER, STAGES
 from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.processes.collector import Collector
-from fieldpose.deploy.processes.endpoints import check_free, free_port, peer_address
+from fieldpose.deploy.processes.endpoints import check_free, free_port
 from fieldpose.deploy.processes.programs import members, preloading, programs
 from fieldpose.deploy.processes.supervision import Supervisor
 from fieldpose.deploy.recording_options import RecordingOptions, recorded_files, unfinished_files
@@ -41,7 +42,8 @@ _RECORDER_FINISHES_S = 60.0
 class Run:
     """Plans on this machine, of one pipeline each, with one hub and one recorder.
 
-    listen: the hub's address (default: a free port); logs: a folder to keep; recording: how it is recorded.
+    listen: the hub's address (default: a free port); logs: a folder to keep; recording: how it is recorded; entry: who
+    is let in.
     """
 
     plans: tuple[Plan, ...]
@@ -49,6 +51,7 @@ class Run:
     listen: str | None = None
     logs: Path | None = None
     recording: RecordingOptions = field(default_factory=RecordingOptions)
+    entry: Entry = field(default_factory=Entry)
 
     @property
     def recorded(self) -> bool:
@@ -93,28 +96,33 @@ def run_pipeline(plan: Plan, report: Report = lambda progress: None, record: Pat
 def run_pipelines(run: Run, report: Report = lambda progress: None) -> list[RunResult]:
     """Run the sources to their ends, or until Ctrl-C or SIGTERM, and end every process; gives a result for each plan.
 
-    Raises ProcessError where a process cannot start or does not stay up, TransportError for a bad or used address,
+    Raises ProcessError where a process cannot start or does not stay up, TransportError for a bad or used address or
+    certificates that are missing, UsageError for an address that other hosts reach and nobody is kept out of,
     RecordingError for a recording that is in the way. One that could not be finished is told of in the results: for
     want of a disk nothing stops tracking.
     """
     fields = {plan.field for plan in run.plans if plan.field is not None}
     run.recording.check(run.record, len(run.plans), sum(field.stat().st_size for field in fields))
     check_free(run.listen)
-    with StopSignals() as signals, _folder(run.logs) as folder:
-        hub = run.listen or f"tcp/127.0.0.1:{free_port()}"
-        made = programs(run.plans, folder, hub, run.record, run.recording)
+    with (
+        StopSignals() as signals,
+        _folder(run.logs) as folder,
+        hub_keys(run.listen or f"tcp/127.0.0.1:{free_port()}", run.entry) as (hub, keys),
+    ):
+        at = Joint(hub, None if keys is None else access_as(keys, OBSERVER))
+        made = programs(run.plans, folder, hub, run.record, run.recording, keys)
         with Supervisor(folder, made, preloading(folder)) as supervisor:
-            return _Running(run, supervisor, hub, signals, report).run()
+            return _Running(run, supervisor, at, signals, report).run()
 
 
 class _Running:
-    def __init__(self, run: Run, supervisor: Supervisor, hub: str, signals: StopSignals, report: Report) -> None:
+    def __init__(self, run: Run, supervisor: Supervisor, at: Joint, signals: StopSignals, report: Report) -> None:
         self._of, self._plans = run, run.plans
         self._members = members(run.plans, run.recorded)
         self._cameras = [member.name for member in self._members if member.row.name == CAMERA]
         self._collectors: list[Collector] = []
         self._supervisor = supervisor
-        self._hub = hub
+        self._at = at
         self._stop = signals.stop
         self._report = report
         self._limit = _RESTARTS_AT_START
@@ -123,7 +131,7 @@ class _Running:
 
     def run(self) -> list[RunResult]:
         began = time.monotonic()
-        bus = ZenohBus(self._hub, peer_address(self._hub))
+        bus = self._at.session()
         try:
             self._collectors = [
                 Collector(bus, plan.settings.address, plan.object_from_dataset()) for plan in self._plans
@@ -176,7 +184,7 @@ class _Running:
                 break
             if time.monotonic() > deadline:
                 raise ProcessError(f"not ready after {_START_S:g} s: {', '.join(waiting)}")
-            self._report(Progress("starting", waiting, hub=self._hub))
+            self._report(Progress("starting", waiting, hub=self._at.hub))
             self._stop.wait(_POLL_S)
         watching.close()
         self._limit = _RESTARTS

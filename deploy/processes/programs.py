@@ -65,12 +65,17 @@ def _in_order(row: Process, plans: Sequence[Plan]) -> tuple[Plan, ...]:
 
 
 def programs(
-    plans: Sequence[Plan], folder: Path, hub: str, record: Path | None, recording: RecordingOptions = _PLAIN
+    plans: Sequence[Plan], folder: Path, hub: str, record: Path | None, recording: RecordingOptions = _PLAIN,
+    keys: Path | None = None,
 ) -> list[Program]:
-    """The command line and environment of each process; what they read is left in `folder`."""
+    """The command line and environment of each process; what they read is left in `folder`.
+
+    keys: the folder of the certificates of a closed bus; an open one has none.
+    """
     everyone = members(plans, record is not None or recording.snapshots is not None)
     _write_settings(plans, folder, everyone)
-    made = [_program(member, everyone, plans, folder, hub) for member in everyone]
+    joins = ("--connect", hub, *(("--open",) if keys is None else ("--tls", str(keys.resolve()))))
+    made = [_program(member, everyone, plans, folder, joins) for member in everyone]
     recorder = ([] if record is None else ["--record", str(record.resolve())]) + recording.arguments("record.")
     return [
         replace(program, command=[*program.command, *recorder]) if member.row.name == RECORDER else program
@@ -84,11 +89,11 @@ def preloading(folder: Path) -> tuple[str, ...]:
 
 
 def _program(
-    member: Member, everyone: Sequence[Member], plans: Sequence[Plan], folder: Path, hub: str
+    member: Member, everyone: Sequence[Member], plans: Sequence[Plan], folder: Path, joins: Sequence[str]
 ) -> Program:  # fmt: skip
     row, plan = member.row, member.plans[0]
     threads = threads_of(row, max(plan.in_flight for plan in member.plans))
-    command = [*FIELDPOSE, "stage", row.name, "--connect", hub, "--config", str(_settings_file(folder, plan, plans))]
+    command = [*FIELDPOSE, "stage", row.name, *joins, "--config", str(_settings_file(folder, plan, plans))]
     if plan.field is not None:
         command += ["--field", str(plan.field.resolve())]
     command += ["--threads", str(threads)]

@@ -7,15 +7,16 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from fieldpose.deploy.access.joining import Entry
 from fieldpose.deploy.plan import Plan
-from fieldpose.deploy.processes.endpoints import free_port
+from fieldpose.deploy.processes.endpoints import free_port, with_scheme
 from fieldpose.errors import UsageError
 
 _END_S = 10.0
 
 
 @contextmanager
-def page_beside(plans: tuple[Plan, ...], listen: str | None, wanted: bool) -> Iterator[str | None]:
+def page_beside(plans: tuple[Plan, ...], listen: str | None, wanted: bool, entry: Entry) -> Iterator[str | None]:
     """Gives the hub's address that the pipeline is to have; its page is served until the end, where it is wanted.
 
     UsageError where there are several pipelines, of which a page shows one.
@@ -32,8 +33,13 @@ def page_beside(plans: tuple[Plan, ...], listen: str | None, wanted: bool) -> It
     parts = ("--site", address.site, "--object", address.object, "--camera", address.camera)
     # Where all addresses are listened at, this machine's own is one.
     reached = hub.replace("0.0.0.0", "127.0.0.1")
+    if entry.open:
+        entering = ["--open"]
+    else:
+        # By TLS it waits for the keys, which the run makes.
+        reached, entering = with_scheme(reached, "tls"), [] if entry.tls is None else ["--tls", str(entry.tls)]
     viewer = subprocess.Popen(
-        [sys.executable, "-P", "-m", "fieldpose", "view", str(plan.field), "--connect", reached, *parts]
+        [sys.executable, "-P", "-m", "fieldpose", "view", str(plan.field), "--connect", reached, *entering, *parts]
     )
     try:
         yield hub

@@ -349,7 +349,8 @@ class TestProcesses:
     def test_zenoh_logs_to_stderr_and_prints_stay_on_stdout(self, endpoint: str, spawn: Spawn) -> None:
         program = """
             import sys
-            from fieldpose.bus.transport import ZenohBus, log_to_stderr
+            from fieldpose.bus.refusals import log_to_stderr
+            from fieldpose.bus.transport import ZenohBus
             log_to_stderr("warn")
             print("before", flush=True)
             ZenohBus(sys.argv[1]).close()

@@ -90,7 +90,7 @@ def test_mistakes_are_one_line_and_exit_code_2(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     # These change this very process.
-    monkeypatch.setattr("fieldpose.deploy.commands.stage.log_to_stderr", lambda: None)
+    monkeypatch.setattr("fieldpose.deploy.commands.stage.log_to_stderr", lambda **options: None)
     monkeypatch.setattr("fieldpose.deploy.commands.stage.hold_to", lambda threads: None)
     assert main(arguments) == 2
     line = only_line(capsys)
@@ -150,7 +150,7 @@ def test_flags_win_over_the_file_and_the_file_over_the_defaults(tmp_path: Path) 
 def test_a_camera_sends_no_true_poses_of_another_object_than_its_own(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("fieldpose.deploy.commands.stage.log_to_stderr", lambda: None)
+    monkeypatch.setattr("fieldpose.deploy.commands.stage.log_to_stderr", lambda **options: None)
     monkeypatch.setattr("fieldpose.deploy.commands.stage.hold_to", lambda threads: None)
     assert main(["stage", "camera", "--camera.source", "bus", "--camera.truth-of", "can"]) == 2
     assert "truth_of is can, but this camera is of the object object" in capsys.readouterr().err
@@ -191,7 +191,7 @@ def test_a_port_in_use_is_told(field: Path, taken_port: int, capsys: pytest.Capt
 def test_in_real_processes_a_port_in_use_is_told_by_the_hub_too(taken_port: int, tmp_path: Path) -> None:
     ended = fieldpose("stage", "hub", "--listen", f"tcp/127.0.0.1:{taken_port}", cwd=tmp_path)
     assert ended.returncode == 2
-    assert ended.stderr.splitlines()[-1].startswith(f"fieldpose: no hub at tcp/127.0.0.1:{taken_port}")
+    assert ended.stderr.splitlines()[-1].startswith(f"fieldpose: no hub at tls/127.0.0.1:{taken_port}")
     assert "Traceback" not in ended.stderr
 
 

@@ -6,18 +6,20 @@ import socket
 
 import pytest
 
-from fieldpose.deploy.processes.endpoints import check_free, free_port, peer_address
+from fieldpose.deploy.processes.endpoints import check_free, free_port, is_local, peer_address
 from fieldpose.errors import TransportError
 
 
 @pytest.mark.parametrize("hub", ["tcp/127.0.0.1:7447", "tcp/localhost:1", "tls/[::1]:7447"])
 def test_around_a_hub_of_this_machine_nobody_listens_to_others(hub: str) -> None:
-    assert peer_address(hub) == "tcp/127.0.0.1:0"
+    assert peer_address(hub) == hub[:3] + "/127.0.0.1:0"
+    assert is_local(hub)
 
 
 @pytest.mark.parametrize("hub", ["tcp/robot:7447", "tcp/10.0.0.2:7447", "tcp/0.0.0.0:7447"])
 def test_around_a_hub_for_others_everybody_can_be_reached(hub: str) -> None:
     assert peer_address(hub) == "tcp/0.0.0.0:0"
+    assert not is_local(hub)
 
 
 def test_a_port_is_free_until_someone_listens() -> None:

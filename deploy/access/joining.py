@@ -11,10 +11,10 @@ from pathlib import Path
 
 from fieldpose.bus.access import Access, certificate_of, key_of
 from fieldpose.bus.transport import ZenohBus
-from fieldpose.deploy.access.refused import nobody, why_refused
+from fieldpose.deploy.access.refused import nobody, speaks_tls, why_refused
 from fieldpose.deploy.access.roles import role_named, roles
 from fieldpose.deploy.access.run_keys import keys_for, keys_of
-from fieldpose.deploy.processes.endpoints import is_local, peer_address, port_of, with_scheme
+from fieldpose.deploy.processes.endpoints import host_of, is_local, peer_address, port_of, with_scheme
 from fieldpose.errors import TransportError, UsageError
 
 TLS_VARIABLE = "FIELDPOSE_TLS"
@@ -76,29 +76,33 @@ class Joint:
 def joint(hub: str, entry: Entry, names: Sequence[str], timeout_s: float = 0.0) -> Joint:
     """How a process in the first of these roles that there are keys of joins a hub.
 
-    timeout_s: how long keys of this machine are waited for, where the address is one of TLS. Raises UsageError and
-    TransportError.
+    timeout_s: how long a hub of this machine is waited for, which makes the keys. Raises UsageError and TransportError.
     """
     folder = entry.folder
     if folder is not None:
         return Joint(with_scheme(hub, "tls"), _access(folder, names))
     if entry.open:
         return Joint(hub)
+    if not is_local(hub):
+        check_open(peer_address(hub), entry)
+        return Joint(hub)
     deadline = time.monotonic() + timeout_s
-    while True:
-        local = keys_of(port_of(hub)) if is_local(hub) else None
-        if local is not None:
-            return Joint(with_scheme(hub, "tls"), _access(local, names))
-        if not hub.startswith("tls/"):
-            break
+    while (local := keys_of(port_of(hub))) is None:
+        if not hub.startswith("tls/") and speaks_tls(host_of(hub), port_of(hub)) is False:
+            return Joint(hub)
         if time.monotonic() > deadline:
-            raise TransportError(
-                f"{hub} is closed, and this user has no keys for it: no run of yours on this machine has that port; for"
-                " another host's give --tls DIR, as `fieldpose certs` makes it"
-            )
+            raise TransportError(why_refused(hub, None) or _no_keys(hub, timeout_s))
         time.sleep(_LOOK_S)
-    check_open(peer_address(hub), entry)
-    return Joint(hub)
+    return Joint(with_scheme(hub, "tls"), _access(local, names))
+
+
+def _no_keys(hub: str, waited_s: float) -> str:
+    if not hub.startswith("tls/"):
+        return nobody(hub, None, waited_s)
+    return (
+        f"{hub} is closed, and this user has no keys for it: no run of yours on this machine has that port; for another"
+        " host's give --tls DIR, as `fieldpose certs` makes it"
+    )
 
 
 def join(hub: str, entry: Entry, names: Sequence[str], timeout_s: float) -> ZenohBus:

@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from fieldpose.deploy import checks
+from fieldpose.deploy.access.checks import closed, listening
 from fieldpose.deploy.checks import Check, Finding
 from fieldpose.deploy.reporting.output import progress_console, result_console, write_json
 
@@ -49,7 +50,7 @@ class Options:
             yield from check()
 
     def _checks(self) -> Iterator[Check]:
-        yield from (checks.machine, checks.packages, checks.bus, checks.backend, checks.kernels)
+        yield from (checks.machine, checks.packages, checks.bus, listening, closed, checks.backend, checks.kernels)
         yield from (checks.weights, checks.demo_scene)
         if self.field is not None:
             yield partial(checks.field, self.field)

@@ -124,7 +124,7 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     awaited = options.wait_for if options.wait_for is not None else _passed(plans[0]) if row.name == CAMERA else ()
     if row.solves and any(plan.follows for plan in plans):
         os.nice(_GIVES_WAY)
-    way = joint(options.connect, options.entry, (row.name,))
+    way = joint(options.connect, options.entry, (row.name,), _START_S)
     if options.listen is not None and way.access is None:
         check_open(options.listen, options.entry)
     bus = way.session(options.listen)

@@ -60,7 +60,7 @@ def bus(hub: str) -> Iterator[ZenohBus]:
 def test_a_stage_that_is_killed_is_forked_again_and_ends_when_it_is_asked_to(
     tmp_path: Path, hub: str, bus: ZenohBus
 ) -> None:
-    programs = [stage(name, "--connect", hub) for name in ("hub", "pnp")]
+    programs = [stage(name, "--connect", hub, "--open") for name in ("hub", "pnp")]
     with Supervisor(tmp_path, programs, STAGES_ALONE) as supervisor:
         wait_for(bus, Address(), ["pnp"], 60.0)
         first = supervisor.poll()["pnp"].pid

@@ -18,15 +18,17 @@ from typing import Any
 
 import psutil
 import pytest
+import zenoh
 from support.bus_samples import ADDRESS
 from support.commands import command
 
 from fieldpose.bus.access import Access, Role, access_control, certificate_of, key_of
 from fieldpose.bus.refusals import Refusals, link_reason
-from fieldpose.bus.topics import ALL, CONTROL, GUESS, PRIOR, STATE, STATS, VIEW
+from fieldpose.bus.topics import ALL, CONTROL, FRAME, GUESS, PRIOR, STATE, STATS, VIEW
 from fieldpose.bus.transport import ZenohBus, wait_for
 from fieldpose.deploy.access import run_keys
 from fieldpose.deploy.access.certificates import Authority, make_certificates
+from fieldpose.deploy.access.checks import closed, listening
 from fieldpose.deploy.access.joining import Entry, Joint, access_as, check_open, joined, joint
 from fieldpose.deploy.access.roles import OPERATOR, PRIOR_SOURCE, PROGRAM, VIEWER, role_named, roles
 from fieldpose.deploy.graph import GRAPH, HUB, OBSERVER, Process
@@ -98,6 +100,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def hub(certificates: Path) -> Iterator[Hub]:
     with a_hub(certificates) as made:
+        made.session(VIEWER).close()
         yield made
 
 
@@ -456,3 +459,48 @@ def test_certificates_are_never_overwritten(certificates: Path) -> None:
     with pytest.raises(FieldposeError, match="is there already, and is not overwritten"):
         make_certificates(certificates, [VIEWER])
     assert certificate_of(certificates, VIEWER).read_bytes() == before
+
+
+def test_the_configuration_for_other_languages_sends_frames_and_nothing_else(
+    hub: Hub, certificates: Path, sessions: Callable[..., ZenohBus], tmp_path: Path
+) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "security.md").read_text(encoding="utf-8")
+    block = text.split("```json5\n")[1].split("```")[0]
+    # The hub's certificate is compared with its name here: Zenoh does so unless it is told not to.
+    file = tmp_path / "camera.json5"
+    port = hub.address.rpartition(":")[2]
+    file.write_text(block.replace("certs/", f"{certificates}/").replace("robot:7447", f"localhost:{port}"))
+    heard: set[str] = set()
+    listener = sessions(OBSERVER)
+    for topic in (FRAME, GUESS):
+        listener.subscribe(ADDRESS.key(topic), lambda key, payload, at: heard.add(key), 64)
+    listener.settle(READY_S)
+    with zenoh.open(zenoh.Config.from_file(str(file))) as session:
+
+        def frame_came() -> bool:
+            session.put(ADDRESS.key(GUESS), b"evil")
+            session.put(ADDRESS.key(FRAME), b"image")
+            return bool(heard)
+
+        assert until(frame_came)
+    assert heard == {ADDRESS.key(FRAME)}
+
+
+def test_doctor_says_who_listens_where_and_that_strangers_are_kept_out(hub: Hub) -> None:
+    port = hub.address.rpartition(":")[2]
+    (its,) = [finding for finding in listening() if f"hub {port}" in finding.detail]
+    assert (its.what, its.status) == ("listening", "ok")
+    assert its.detail.startswith("127.0.0.1: ")
+    assert its.detail.endswith("closed by certificates")
+    (tried,) = closed()
+    assert (tried.what, tried.status) == ("strangers", "ok")
+
+
+def test_doctor_warns_of_a_hub_that_everybody_reaches(certificates: Path) -> None:
+    address = f"tcp/0.0.0.0:{free_port()}"
+    entry = Entry(open=True)
+    with a_hub(certificates, "--open", address=address), joined(address, entry, (), READY_S):
+        (its,) = [finding for finding in listening() if f"hub {address.rpartition(':')[2]}" in finding.detail]
+    assert its.status == "warning"
+    assert its.detail.startswith("0.0.0.0: ")
+    assert its.detail.endswith("; open")

@@ -19,7 +19,7 @@ from fieldpose.errors import TransportError, UsageError
 
 TLS_VARIABLE = "FIELDPOSE_TLS"
 """Environment variable with the folder of certificates, where no option names it."""
-_LOOK_S = 0.1
+_LOOK_S, _LEAST_S = 0.1, 1.0
 _FIRST_S, _LONGEST_S = 0.5, 8.0
 
 
@@ -82,10 +82,12 @@ def joint(hub: str, entry: Entry, names: Sequence[str], timeout_s: float = 0.0) 
     if folder is not None:
         return Joint(with_scheme(hub, "tls"), _access(folder, names))
     if entry.open:
-        return Joint(hub)
+        return Joint(_without_tls(hub))
     if not is_local(hub):
-        check_open(peer_address(hub), entry)
-        return Joint(hub)
+        raise UsageError(
+            f"{hub} is of another host: give --tls DIR, with certificates of `fieldpose certs` as its hub has them, or"
+            " --open where that hub lets everybody in"
+        )
     deadline = time.monotonic() + timeout_s
     while (local := keys_of(port_of(hub))) is None:
         if not hub.startswith("tls/") and speaks_tls(host_of(hub), port_of(hub)) is False:
@@ -107,10 +109,11 @@ def _no_keys(hub: str, waited_s: float) -> str:
 
 def join(hub: str, entry: Entry, names: Sequence[str], timeout_s: float) -> ZenohBus:
     """A session in the first of these roles that there are keys of, once its hub answers; see `joint`."""
+    deadline = time.monotonic() + timeout_s
     way = joint(hub, entry, names, timeout_s)
     bus = way.session()
     try:
-        way.wait(bus, timeout_s)
+        way.wait(bus, max(deadline - time.monotonic(), _LEAST_S))
     except BaseException:
         bus.close()
         raise
@@ -137,21 +140,27 @@ def hub_keys(listen: str, entry: Entry) -> Iterator[tuple[str, Path | None]]:
     folder = entry.folder
     if folder is not None:
         yield with_scheme(listen, "tls"), folder
-    elif entry.open or not is_local(listen):
-        check_open(listen, entry)
-        yield listen, None
+    elif entry.open:
+        yield _without_tls(listen), None
     else:
+        check_kept_out(listen)
         with keys_for(port_of(listen)) as made:
             yield with_scheme(listen, "tls"), made
 
 
-def check_open(listen: str, entry: Entry) -> None:
-    """Raise UsageError for an address that others reach, where nobody is kept out and nobody has asked for that."""
-    if not entry.open and not is_local(listen):
+def check_kept_out(listen: str) -> None:
+    """Raise UsageError for an address that other hosts reach, where nobody is kept out."""
+    if not is_local(listen):
         raise UsageError(
             f"{listen} can be reached by other hosts, and everybody there could read, and take over, what runs; give"
             " --tls DIR, with certificates of `fieldpose certs DIR`, or --open to have it so"
         )
+
+
+def _without_tls(address: str) -> str:
+    if address.startswith("tls/"):
+        raise UsageError(f"{address} is an address of TLS, which --open goes without; write tcp/ instead")
+    return address
 
 
 def access_as(folder: Path, role: str) -> Access:

@@ -11,6 +11,7 @@ import os
 import shutil
 import stat
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -21,7 +22,8 @@ import psutil
 from fieldpose.deploy.access.roles import roles
 from fieldpose.errors import OutputError, TransportError
 
-_OWNER = "owner.json"
+_OWNER, _NEW = "owner.json", "new-"
+_MADE_S = 60.0
 _PRIVATE = 0o700
 
 
@@ -76,7 +78,7 @@ def all_keys() -> list[RunKeys]:
 def _made(base: Path) -> Path:
     from fieldpose.deploy.access.certificates import make_certificates
 
-    folder = Path(tempfile.mkdtemp(dir=base, prefix="new-"))
+    folder = Path(tempfile.mkdtemp(dir=base, prefix=_NEW))
     make_certificates(folder, [role.name for role in roles()])
     process = psutil.Process()
     (folder / _OWNER).write_text(json.dumps({"pid": process.pid, "began": process.create_time()}), encoding="utf-8")
@@ -126,5 +128,7 @@ def _owner(folder: Path) -> int | None:
 
 def _remove_stale(base: Path) -> None:
     for folder in base.iterdir():
-        if folder.name.isdigit() and _owner(folder) is None:
-            shutil.rmtree(folder, ignore_errors=True)
+        with suppress(FileNotFoundError):
+            unfinished = folder.name.startswith(_NEW) and time.time() - folder.stat().st_mtime > _MADE_S
+            if unfinished or (folder.name.isdigit() and _owner(folder) is None):
+                shutil.rmtree(folder, ignore_errors=True)

@@ -16,7 +16,7 @@ from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.node import Handler, run_nodes
 from fieldpose.bus.refusals import log_to_stderr
 from fieldpose.bus.transport import LOCAL_HUB, serve_hub, wait_for
-from fieldpose.deploy.access.joining import Entry, access_as, check_open, hub_keys, joint
+from fieldpose.deploy.access.joining import Entry, access_as, check_kept_out, hub_keys, joint
 from fieldpose.deploy.graph import (
     AT_WORK,
     BY_NAME,
@@ -125,8 +125,8 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     if row.solves and any(plan.follows for plan in plans):
         os.nice(_GIVES_WAY)
     way = joint(options.connect, options.entry, (row.name,), _START_S)
-    if options.listen is not None and way.access is None:
-        check_open(options.listen, options.entry)
+    if options.listen is not None and way.access is None and not options.entry.open:
+        check_kept_out(options.listen)
     bus = way.session(options.listen)
     for plan in plans:
         _tell(plan, row)

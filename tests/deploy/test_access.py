@@ -29,7 +29,7 @@ from fieldpose.bus.transport import ZenohBus, wait_for
 from fieldpose.deploy.access import run_keys
 from fieldpose.deploy.access.certificates import Authority, make_certificates
 from fieldpose.deploy.access.checks import closed, listening
-from fieldpose.deploy.access.joining import Entry, Joint, access_as, check_open, joined, joint
+from fieldpose.deploy.access.joining import Entry, Joint, access_as, hub_keys, joined, joint
 from fieldpose.deploy.access.roles import OPERATOR, PRIOR_SOURCE, PROGRAM, VIEWER, role_named, roles
 from fieldpose.deploy.graph import GRAPH, HUB, OBSERVER, Process
 from fieldpose.deploy.processes.endpoints import free_port, with_scheme
@@ -420,12 +420,20 @@ class TestKeysOfARun:
 class TestOpenToOthers:
     @pytest.mark.parametrize("listen", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "tls/0.0.0.0:7447", "udp/0.0.0.0:7447"])
     def test_an_address_that_others_reach_is_refused_unless_one_says_so(self, listen: str) -> None:
-        with pytest.raises(UsageError, match=r"can be reached by other hosts.*--tls DIR.* or --open"):
-            check_open(listen, Entry())
-        check_open(listen, Entry(open=True))
+        with (
+            pytest.raises(UsageError, match=r"can be reached by other hosts.*--tls DIR.* or --open"),
+            hub_keys(listen, Entry()),
+        ):
+            pass
+
+    def test_open_is_open_and_without_tls(self) -> None:
+        with hub_keys("tcp/0.0.0.0:7447", Entry(open=True)) as made:
+            assert made == ("tcp/0.0.0.0:7447", None)
+        with pytest.raises(UsageError, match="write tcp/ instead"), hub_keys("tls/0.0.0.0:7447", Entry(open=True)):
+            pass
 
     def test_a_client_of_another_host_says_which(self) -> None:
-        with pytest.raises(UsageError, match="can be reached by other hosts"):
+        with pytest.raises(UsageError, match=r"tcp/robot:7447 is of another host: give --tls DIR.* or --open"):
             joint("tcp/robot:7447", Entry(), (VIEWER,))
         assert joint("tcp/robot:7447", Entry(open=True), (VIEWER,)).access is None
 

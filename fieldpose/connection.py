@@ -35,7 +35,7 @@ class Connection:
     def __init__(
         self, hub: str, address: Address, timeout_s: float, entry: Entry = NO_ENTRY, roles: Sequence[str] = (PROGRAM,)
     ) -> None:
-        self._bus, self._address = join(hub, entry, roles, timeout_s), address
+        self._bus, self._address = join(hub, entry, roles, timeout_s, coming_s=0.0), address
         try:
             self._states = Inbox(self._bus, address, (STATE,), {STATE: _KEPT_STATES})
             self._bus.settle(timeout_s, images=True)

@@ -19,7 +19,7 @@ from fieldpose.errors import TransportError, UsageError
 
 TLS_VARIABLE = "FIELDPOSE_TLS"
 """Environment variable with the folder of certificates, where no option names it."""
-_LOOK_S, _LEAST_S = 0.1, 1.0
+_LOOK_S, _LEAST_S, _COMING_S = 0.1, 1.0, 60.0
 _FIRST_S, _LONGEST_S = 0.5, 8.0
 
 
@@ -47,10 +47,14 @@ NO_ENTRY = Entry()
 
 @dataclass(frozen=True)
 class Joint:
-    """How to reach a hub: its address, and one's own part on a closed bus, None on an open one."""
+    """How to reach a hub: its address, and one's own part on a closed bus, None on an open one.
+
+    coming: it is of a run of this user's that is up, or about to be.
+    """
 
     hub: str
     access: Access | None = None
+    coming: bool = False
 
     def session(self, listen: str | None = None) -> ZenohBus:
         """A session that listens for the others. Raises TransportError."""
@@ -69,7 +73,7 @@ class Joint:
                 if reason is not None:
                     raise TransportError(reason) from None
                 if left_s <= pause_s:
-                    raise TransportError(nobody(self.hub, self.access, timeout_s)) from None
+                    raise TransportError(nobody(self.hub, self.access, round(timeout_s, 1))) from None
             pause_s = min(2 * pause_s, _LONGEST_S)
 
 
@@ -95,7 +99,7 @@ def joint(hub: str, entry: Entry, names: Sequence[str], timeout_s: float = 0.0) 
         if time.monotonic() > deadline:
             raise TransportError(why_refused(hub, None) or _no_keys(hub, timeout_s))
         time.sleep(_LOOK_S)
-    return Joint(with_scheme(hub, "tls"), _access(local, names))
+    return Joint(with_scheme(hub, "tls"), _access(local, names), coming=True)
 
 
 def _no_keys(hub: str, waited_s: float) -> str:
@@ -107,10 +111,15 @@ def _no_keys(hub: str, waited_s: float) -> str:
     )
 
 
-def join(hub: str, entry: Entry, names: Sequence[str], timeout_s: float) -> ZenohBus:
-    """A session in the first of these roles that there are keys of, once its hub answers; see `joint`."""
+def join(hub: str, entry: Entry, names: Sequence[str], timeout_s: float, coming_s: float = _COMING_S) -> ZenohBus:
+    """A session in the first of these roles that there are keys of, once its hub answers; see `joint`.
+
+    coming_s: how long one is waited for at least that is known to be coming.
+    """
     deadline = time.monotonic() + timeout_s
     way = joint(hub, entry, names, timeout_s)
+    if way.coming:
+        deadline = max(deadline, time.monotonic() + coming_s)
     bus = way.session()
     try:
         way.wait(bus, max(deadline - time.monotonic(), _LEAST_S))

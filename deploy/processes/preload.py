@@ -97,7 +97,10 @@ def _tracking(settings: Settings, field: Path | None) -> None:
         warm_up()
 
 
-_IMPORTED = ("fieldpose.deploy.commands.stage", "fieldpose.stages.nerf.loading", "fieldpose.stages.pnp.core")
+_IMPORTED = (
+    "fieldpose.deploy.commands.stage", "fieldpose.deploy.access.certificates", "fieldpose.stages.nerf.loading",
+    "fieldpose.stages.pnp.core",
+)  # fmt: skip
 _KERNELS = {"rendering": _rendering, "pnp": _pnp, "tracking": _tracking}
 """By the process that cannot do without."""
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldpose.bus.access import Access, certificate_of, key_of
-from fieldpose.bus.transport import ZenohBus
+from fieldpose.bus.transport import ZenohBus, checked_endpoint
 from fieldpose.deploy.access.refused import nobody, speaks_tls, why_refused
 from fieldpose.deploy.access.roles import role_named, roles
 from fieldpose.deploy.access.run_keys import keys_for, keys_of
@@ -82,6 +82,7 @@ def joint(hub: str, entry: Entry, names: Sequence[str], timeout_s: float = 0.0) 
 
     timeout_s: how long a hub of this machine is waited for, which makes the keys. Raises UsageError and TransportError.
     """
+    checked_endpoint(hub)
     folder = entry.folder
     if folder is not None:
         return Joint(with_scheme(hub, "tls"), _access(folder, names))

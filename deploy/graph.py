@@ -116,14 +116,19 @@ def _recorder(parts: Parts, launch: Launch) -> Handler:
 def _camera(parts: Parts, launch: Launch) -> Handler:
     from fieldpose.stages.camera.node import CameraNode
 
-    config, own = parts.settings.camera, parts.settings.address.object
-    if config.truth_of not in (None, own):
-        raise ConfigError(
-            f"camera: truth_of is {config.truth_of}, but this camera is of the object {own}; give --address.object"
-        )
+    config = parts.settings.camera
     # A source that knows its frames' poses knows their cameras too.
     known = tuple if config.source and knows_truth(config.source) else parts.known_cameras
     return CameraNode(config, known, launch.wait_until_ready)
+
+
+def check_camera(plan: Plan) -> None:
+    """Raise ConfigError for a camera that is to send true poses under another object's key."""
+    wanted, own = plan.settings.camera.truth_of, plan.settings.address.object
+    if wanted not in (None, own):
+        raise ConfigError(
+            f"camera: truth_of is {wanted}, but this camera is of the object {own}; give --address.object"
+        )
 
 
 def _perturbation(parts: Parts, launch: Launch) -> Handler:

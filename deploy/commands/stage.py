@@ -27,6 +27,7 @@ from fieldpose.deploy.graph import (
     STAGES,
     Launch,
     Process,
+    check_camera,
     rows_of,
     threads_of,
 )  # fmt: skip
@@ -122,6 +123,8 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     address = plans[0].settings.address
     # In whatever order they are started, the first frame finds all that work on it.
     awaited = options.wait_for if options.wait_for is not None else _passed(plans[0]) if row.name == CAMERA else ()
+    if row.name == CAMERA:
+        check_camera(plans[0])
     if row.solves and any(plan.follows for plan in plans):
         os.nice(_GIVES_WAY)
     way = joint(options.connect, options.entry, (row.name,), _START_S)

@@ -66,7 +66,7 @@ class CameraOrigin(StrEnum):
 
 
 Encoding = Literal["rgb8", "jpeg", "png"]
-Changes = Literal["reset", "set_guess", "set_solving"]
+Changes = Literal["reset", "set_guess", "set_solving", "take_keyframe"]
 
 
 class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -37,7 +37,8 @@ class ControlValues(Response, kw_only=True):
     state: of the newest frame, INITIALIZING before the first and after a reset. frames: how many have come; requests:
     how many that change something were carried out. solves_per_s: how often a frame is solved at least, at most 100;
     None where frames are not followed. begins_at: (4, 4) where tracking begins when nothing is known of the camera;
-    None where training views are tried, and where frames stand each by itself.
+    None where training views are tried, and where frames stand each by itself. keyframes: how many views are kept
+    because that was asked for; None where frames are not followed.
     """
 
     state: TrackingState
@@ -45,6 +46,7 @@ class ControlValues(Response, kw_only=True):
     requests: int
     solves_per_s: float | None
     begins_at: np.ndarray | None
+    keyframes: int | None = None
     _arrays: ClassVar = {"begins_at": POSE}
 
 
@@ -100,6 +102,10 @@ class SetSolving(Request[ControlValues], kw_only=True, tag="set_solving"):
             raise ValueError(f"solves_per_s: {self.solves_per_s:g} where 0 to {MOST_SOLVES_PER_S:g} is expected")
 
 
+class TakeKeyframe(Request[ControlValues], kw_only=True, tag="take_keyframe"):
+    """Solve the next frame that is followed well, from where it was followed; keep its view if that is borne out."""
+
+
 class Show(Request[ControlValues], kw_only=True, tag="show"):
     """Change nothing, and say how things are."""
 
@@ -119,7 +125,8 @@ class SaveSnapshot(Request[SnapshotSaved], kw_only=True, tag="save_snapshot"):
 
 
 KINDS: dict[str, type[Request[Any]]] = {
-    "reset": Reset, "set_guess": SetGuess, "set_solving": SetSolving, "show": Show, "save_snapshot": SaveSnapshot,
+    "reset": Reset, "set_guess": SetGuess, "set_solving": SetSolving, "take_keyframe": TakeKeyframe, "show": Show,
+    "save_snapshot": SaveSnapshot,
 }  # fmt: skip
 
 

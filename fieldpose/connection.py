@@ -12,7 +12,7 @@ import numpy as np
 from fieldpose.bus.control import ask_one
 from fieldpose.bus.messages import CameraOrigin, Encoding, Prior, State
 from fieldpose.bus.ports import Inbox, Outbox, first_header
-from fieldpose.bus.requests import ControlValues, Request, Reset, SetGuess, SetSolving, Show
+from fieldpose.bus.requests import ControlValues, Request, Reset, SetGuess, SetSolving, Show, TakeKeyframe
 from fieldpose.bus.topics import PRIOR, STATE, Address
 from fieldpose.bus.transport import LOCAL_HUB
 from fieldpose.deploy.access.joining import NO_ENTRY, Entry, join
@@ -107,6 +107,14 @@ class Connection:
         except ValueError as error:
             raise ConfigError(str(error)) from None
         return self._ask(request, timeout_s)
+
+    def take_keyframe(self, timeout_s: float = 5.0) -> ControlValues:
+        """Have the next frame that is followed well solved at once, and its view kept if the solve bears that out.
+
+        The answer comes before; `values().keyframes` grows, up to eight, once it is kept. Raises FieldposeError where
+        the camera is not tracked, where frames are not followed, or without an answer.
+        """
+        return self._ask(TakeKeyframe(), timeout_s)
 
     def _ask(self, request: Request[ControlValues], timeout_s: float) -> ControlValues:
         return ask_one(self._bus, self._address, "tracking", request, timeout_s)

@@ -11,7 +11,16 @@ from typing import Annotated, Literal
 import tyro
 
 from fieldpose.bus.control import ask_stage
-from fieldpose.bus.requests import MOST_SOLVES_PER_S, ControlValues, Request, Reset, SetGuess, SetSolving, Show
+from fieldpose.bus.requests import (
+    MOST_SOLVES_PER_S,
+    ControlValues,
+    Request,
+    Reset,
+    SetGuess,
+    SetSolving,
+    Show,
+    TakeKeyframe,
+)
 from fieldpose.bus.topics import Address
 from fieldpose.bus.transport import LOCAL_HUB
 from fieldpose.deploy.access.joining import Entry, joined
@@ -31,11 +40,13 @@ class Options:
 
     show: how tracking is. reset: forget what is believed of the camera, and begin again as the run has begun. guess
     GUESS: begin again at a pose. solve RATE: solve a frame at least so often a second, where frames are followed; 0:
-    only where following needs it. What was accepted stands in recordings, under the topic `control`, and is forgotten
-    where the process of tracking has to be started again.
+    only where following needs it. keyframe: solve the next frame that is followed well, and keep its view for
+    following, whatever comes after it, if the solve bears out what was followed; the newest eight are kept. What was
+    accepted stands in recordings, under the topic `control`, and is forgotten where the process of tracking has to be
+    started again.
     """
 
-    action: tyro.conf.Positional[Literal["show", "reset", "guess", "solve"]]
+    action: tyro.conf.Positional[Literal["show", "reset", "guess", "solve", "keyframe"]]
     """What to do."""
     value: tyro.conf.Positional[str | None] = None
     """For guess: train:NAME, with --field, or a JSON file {"cam_from_object": 4x4}; for solve: 0 to 100 a second."""
@@ -74,7 +85,7 @@ class Options:
         return _guess(self.value, self.field) if self.action == "guess" else _solving(self.value)
 
 
-_PLAIN: dict[str, Callable[[], Request[ControlValues]]] = {"show": Show, "reset": Reset}
+_PLAIN: dict[str, Callable[[], Request[ControlValues]]] = {"show": Show, "reset": Reset, "keyframe": TakeKeyframe}
 _EXAMPLES = {"guess": "guess train:047 --field mine.safetensors", "solve": "solve 2"}
 
 
@@ -106,6 +117,8 @@ def in_words(values: ControlValues) -> str:
     rate = values.solves_per_s
     words = [str(values.state), f"{values.frames} frames"]
     words.append("not followed" if rate is None else f"solved at least {rate:g} times a second")
+    if values.keyframes:
+        words.append(f"{values.keyframes} keyframe{'s' * (values.keyframes > 1)} kept")
     if values.begins_at is not None:
         words.append("begins at a guess")
     return ", ".join([*words, f"{values.requests} requests carried out"])

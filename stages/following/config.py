@@ -61,6 +61,8 @@ TOGETHER = 3
 """Points of so many views at once."""
 COARSE_POINTS = 80
 """Looked for at the coarsest level; half as many again at each finer one but the last."""
+KEYFRAMES = 8
+"""Views that are kept because that was asked for; beyond them the oldest goes."""
 LEAST_FOUND = 8
 """Fewer points are no pose."""
 POINTS_BY_LEVEL = (400, 280, 190, 120, 70)

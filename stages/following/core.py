@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from cachetools import LRUCache
+from cachetools import FIFOCache, LRUCache
 
 from fieldpose.stages.alignment.agreement import covariance_of, fit_agreeing
 from fieldpose.stages.alignment.constants import FOUND_PX
@@ -22,7 +22,7 @@ from fieldpose.stages.alignment.least_squares import CONVERGED, PoseFit
 from fieldpose.stages.alignment.placing import warped
 from fieldpose.stages.alignment.views import ViewPoints
 from fieldpose.stages.following.choice import Chosen, Found, chosen_points, is_found
-from fieldpose.stages.following.config import COARSE_POINTS, LEAST_FOUND, LEVELS, TOGETHER, FollowingConfig
+from fieldpose.stages.following.config import COARSE_POINTS, KEYFRAMES, LEAST_FOUND, LEVELS, TOGETHER, FollowingConfig
 from fieldpose.stages.geometry import Camera, exp_se3, log_se3, twist_covariance, viewing_angles
 from fieldpose.stages.geometry.arrays import Covariance, Depth, Flags, Grey, Pixels32, Transform
 
@@ -74,12 +74,22 @@ class Follower:
     def __init__(self, config: FollowingConfig) -> None:
         self._config = config
         self._views: LRUCache[str, ViewPoints] = LRUCache(config.views)
+        self._keyframes: FIFOCache[str, ViewPoints] = FIFOCache(KEYFRAMES)
 
     def __contains__(self, view_id: str) -> bool:
-        return view_id in self._views
+        return view_id in self._views or view_id in self._keyframes
 
     def __len__(self) -> int:
-        return len(self._views)
+        return len(self._all)
+
+    @property
+    def keyframes(self) -> int:
+        """How many views are kept, whatever is seen after them."""
+        return len(self._keyframes)
+
+    @property
+    def _all(self) -> dict[str, ViewPoints]:
+        return {**self._keyframes, **self._views}
 
     def add(self, view_id: str, grey: Grey, depth: Depth, camera: Camera, cam_from_object: Transform) -> None:
         """Remember a view's points with the most texture; one that is known comes to mind again."""
@@ -90,9 +100,15 @@ class Follower:
         if len(points) >= LEAST_FOUND:
             self._views[view_id] = ViewPoints.of(grey, depth, camera, cam_from_object, points, LEVELS)
 
+    def keep(self, view_id: str) -> None:
+        """Keep a view, if it is remembered, however many come after it; beyond KEYFRAMES the oldest of these goes."""
+        view = self._views.get(view_id)
+        if view is not None:
+            self._keyframes[view_id] = view
+
     def angle(self, cam_from_object: Transform) -> float:
         """How differently, in radians, the nearest view has seen what a camera there sees; infinite without any."""
-        return min((difference(view, cam_from_object) for view in self._views.values()), default=np.inf)
+        return min((difference(view, cam_from_object) for view in self._all.values()), default=np.inf)
 
     def follow(self, frame: FramePyramid, starts: Iterable[Transform], points: int) -> Followed | None:
         """The frame's pose near one of the poses to start from, the most likely first; None where too few are found.
@@ -115,7 +131,7 @@ class Follower:
         return _better(chosen, frame, _followed(chosen, frame, fit.cam_from_object), start)
 
     def _chosen(self, frame: FramePyramid, pose: Transform, points: int) -> Chosen:
-        nearest = sorted(self._views.values(), key=lambda view: difference(view, pose))[:TOGETHER]
+        nearest = sorted(self._all.values(), key=lambda view: difference(view, pose))[:TOGETHER]
         return chosen_points([(view, warped(view, frame, pose)) for view in nearest], frame, points)
 
 

@@ -1,4 +1,4 @@
-"""What can be asked of tracking while it runs: to begin again, to begin elsewhere, to solve more or less often."""
+"""What can be asked of tracking while it runs: to begin again or elsewhere, to solve more often, to keep a view."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from fieldpose.bus.messages import Changes, Control, TrackingState
 from fieldpose.bus.node import Output, first_header
-from fieldpose.bus.requests import ControlValues, Request, Reset, SetGuess, SetSolving, Show
+from fieldpose.bus.requests import ControlValues, Request, Reset, SetGuess, SetSolving, Show, TakeKeyframe
 from fieldpose.bus.topics import CONTROL
 from fieldpose.errors import RefusedError
 from fieldpose.stages.geometry import nearest_rigid
@@ -64,6 +64,9 @@ class Controls:
             case SetSolving():
                 tracker.solve_at_least(request.solves_per_s)
                 return self._accepted("set_solving", now_ns, solves_per_s=request.solves_per_s), []
+            case TakeKeyframe():
+                tracker.take_keyframe()
+                return self._accepted("take_keyframe", now_ns), []
         raise RefusedError("tracking takes no such request")
 
     def _accepted(
@@ -78,5 +81,5 @@ class Controls:
         tracker = self._tracker
         return ControlValues(
             state=self._state, frames=tracker.counts.received, requests=self._requests,
-            solves_per_s=tracker.solves_per_s, begins_at=tracker.begins_at,
+            solves_per_s=tracker.solves_per_s, begins_at=tracker.begins_at, keyframes=tracker.keyframes,
         )  # fmt: skip

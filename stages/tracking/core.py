@@ -162,6 +162,15 @@ class Tracker:
         """Raises RefusedError: each frame that is admitted is solved."""
         raise RefusedError("frames are not followed here, so that each is solved; there is no rate to be set")
 
+    @property
+    def keyframes(self) -> int | None:
+        """No view outlasts its frame."""
+        return None
+
+    def take_keyframe(self) -> None:
+        """Raises RefusedError: there is nothing that views are kept for."""
+        raise RefusedError("frames are not followed here, so that no view is kept; there is no keyframe to take")
+
     def restart(self, start: Transform | None, now_ns: int) -> list[Output]:
         """Forget what is believed and all frames that have not left; the next begins at `start`, or as the first did.
 

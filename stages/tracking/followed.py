@@ -15,6 +15,7 @@ import numpy as np
 from cachetools import FIFOCache
 
 from fieldpose.bus.messages import GuessReason, Reason
+from fieldpose.errors import RefusedError
 from fieldpose.stages.alignment.images import FramePyramid
 from fieldpose.stages.following.config import POINTS_BY_LEVEL, FollowingConfig
 from fieldpose.stages.following.core import Followed, Follower
@@ -49,6 +50,14 @@ class Measured:
     quality: float
 
 
+@dataclass(frozen=True)
+class Keyframe:
+    """A frame that is solved so that its view is kept, and that view once it is there."""
+
+    frame: FrameInfo
+    view_id: str | None = None
+
+
 class FollowedPolicy(VideoPolicy):
     """A VideoPolicy for the frames that are solved, and the pose of every frame besides.
 
@@ -74,6 +83,8 @@ class FollowedPolicy(VideoPolicy):
         self._kept: deque[Seen] = deque(maxlen=_KEPT_FRAMES)
         self._measured: FIFOCache[int, Measured] = FIFOCache(_KEPT_FRAMES)
         self._asked_ns: int | None = None
+        self._keyframe_wanted = False
+        self._keyframe: Keyframe | None = None
         self._focal = FocalCheck()
         self._filter = PoseFilter()
 
@@ -96,11 +107,30 @@ class FollowedPolicy(VideoPolicy):
         if not self._trust.tracked or measured is None or measured.quality < self._config.score.good:
             self._asked_ns = frame.capture_ns
             return super().first_step(frame)
+        if self._keyframe_wanted:
+            self._keyframe_wanted, self._keyframe = False, Keyframe(frame)
+            self._asked_ns = frame.capture_ns
+            return self._guess(GuessReason.MOTION, measured.followed.cam_from_object)
         ahead = self._motion.predict(frame.capture_ns + int(self._follows.ahead * self.ahead_ms * NS_PER_MS))
         if not self._due(frame.capture_ns) and self.follower.angle(ahead) < np.deg2rad(self._follows.fresh_deg):
             return None
         self._asked_ns = frame.capture_ns
         return self._guess(GuessReason.MOTION, ahead)
+
+    def take_keyframe(self) -> None:
+        """Solve the next frame that is followed well, from where it was followed, and keep its view.
+
+        Only where the solve bears out what was followed; a restart forgets it, but not what is kept. Raises
+        RefusedError where nothing is tracked.
+        """
+        if not self._trust.tracked:
+            raise RefusedError("the camera is not tracked, so that no view would be true; ask again once it is")
+        self._keyframe_wanted = True
+
+    def viewed(self, frame_id: int, view_id: str) -> None:
+        """The view of a frame that is being solved is there, and remembered."""
+        if self._keyframe is not None and self._keyframe.frame.frame_id == frame_id:
+            self._keyframe = replace(self._keyframe, view_id=view_id)
 
     def next_step(self, attempt: Attempt, result: PoseResult) -> Step | None:
         """Following makes a pose exact and tells whether it is right, so that no further pass is needed for that."""
@@ -118,6 +148,7 @@ class FollowedPolicy(VideoPolicy):
         """
         pose, capture_ns = self._usable(result), attempt.frame.capture_ns
         measured = self._measured.get(capture_ns) if self._trust.tracked else None
+        self._keep_keyframe(attempt.frame, measured, pose)
         if measured is not None and not self._speaks_against(measured, capture_ns, pose, result):
             return Belief(self._trust.state, measured.quality, measured.followed.cam_from_object)
         if measured is not None:
@@ -229,6 +260,13 @@ class FollowedPolicy(VideoPolicy):
         self._unconfirmed = (capture_ns, pose)
         self._asked_ns = None
         return False
+
+    def _keep_keyframe(self, frame: FrameInfo, measured: Measured | None, pose: np.ndarray | None) -> None:
+        keyframe, self._keyframe = self._keyframe, None
+        if keyframe is None or keyframe.frame != frame or keyframe.view_id is None:
+            return
+        if measured is not None and pose is not None and self._same.holds(measured.followed.cam_from_object, pose):
+            self.follower.keep(keyframe.view_id)
 
     def _carry_on(self, capture_ns: int, pose: np.ndarray) -> None:
         """Follow from a pose of before to the newest frame, at once where that leads there, else by way of others."""

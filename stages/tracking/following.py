@@ -89,6 +89,7 @@ class FollowingTracker:
             took = min((now_ns - asked_ns) / NS_PER_MS, _LONGEST_AHEAD_MS)
             self._policy.ahead_ms += _SMOOTHING * (took - self._policy.ahead_ms)
         self._policy.follower.add(view_id, grey, depth, camera, cam_from_object)
+        self._policy.viewed(frame_id, view_id)
 
     def on_prior(self, frame_id: int, cam_from_object: np.ndarray, now_ns: int) -> list[Output | FollowedReport]:
         """Take in a guess of a frame's pose from outside; it is used if it comes before the frame, or where lost."""
@@ -119,6 +120,15 @@ class FollowingTracker:
     def solve_at_least(self, per_second: float) -> None:
         """Have a frame solved so often; 0: only where little is found or no view has seen what will be seen soon."""
         self._policy.solve_ms = 1000 / per_second if per_second > 0 else inf
+
+    @property
+    def keyframes(self) -> int | None:
+        """How many views are kept because that was asked for."""
+        return self._policy.follower.keyframes
+
+    def take_keyframe(self) -> None:
+        """See `FollowedPolicy.take_keyframe`. Raises RefusedError where nothing is tracked."""
+        self._policy.take_keyframe()
 
     def restart(self, start: Transform | None, now_ns: int) -> list[Output | FollowedReport]:
         """Forget what is believed and what is being solved; the next frame begins at `start`, or as the first did.

@@ -27,6 +27,7 @@ from fieldpose.bus.requests import (
     SetSolving,
     Show,
     SnapshotSaved,
+    TakeKeyframe,
     decode_answer,
     decode_request,
 )
@@ -35,7 +36,8 @@ from fieldpose.stages.geometry import exp_se3
 
 POSE = exp_se3([0.1, 0.2, 3.0, 0.4, 0.5, 0.6])
 SAMPLES: list[Request[Any]] = [
-    Reset(), SetGuess(cam_from_object=POSE), SetSolving(solves_per_s=2.5), Show(), SaveSnapshot(seconds=10.0),
+    Reset(), SetGuess(cam_from_object=POSE), SetSolving(solves_per_s=2.5), TakeKeyframe(), Show(),
+    SaveSnapshot(seconds=10.0),
 ]  # fmt: skip
 SAVED = SnapshotSaved(path="out/lost-1.mcap", seconds=9.5, messages=700)
 VALUES = ControlValues(state=TrackingState.LOST, frames=7, requests=2, solves_per_s=None, begins_at=POSE)
@@ -93,7 +95,10 @@ def test_as_any_zenoh_client_may_write_it() -> None:
         ({"request": "reset", "version": 2}, "version 2 where 1 is expected"),
         ({"request": "pause", "version": 2}, "version 2 where 1 is expected"),
         ({"request": "reset", "version": True}, "version True where 1 is expected"),
-        ({"version": 1}, "None where one of reset, set_guess, set_solving, show, save_snapshot is expected"),
+        (
+            {"version": 1},
+            "None where one of reset, set_guess, set_solving, take_keyframe, show, save_snapshot is expected",
+        ),
         ({"request": "pause", "version": 1}, "'pause' where one of reset,"),
         ({"request": ["reset"], "version": 1}, "a list where one of reset,"),
         ({"request": "a\n\u202e" * 99, "version": 1}, "where one of reset,"),

@@ -24,7 +24,7 @@ import fieldpose
 from fieldpose.bus.messages import Control, State, TrackingState
 from fieldpose.bus.node import run_node
 from fieldpose.bus.replay import info, read_recording
-from fieldpose.bus.requests import Reset, SetGuess, SetSolving, Show
+from fieldpose.bus.requests import Reset, SetGuess, SetSolving, Show, TakeKeyframe
 from fieldpose.bus.topics import CONTROL, STATE, Address
 from fieldpose.bus.transport import ZenohBus, serve_hub, wait_for
 from fieldpose.deploy.cli import main, parse
@@ -57,6 +57,7 @@ def test_what_is_asked(tmp_path: Path) -> None:
     file.write_text(json.dumps({"cam_from_object": pose.tolist()}))
     assert isinstance(request_of("show"), Show)
     assert isinstance(request_of("reset"), Reset)
+    assert isinstance(request_of("keyframe"), TakeKeyframe)
     solving = request_of("solve", "2.5")
     assert isinstance(solving, SetSolving)
     assert solving.solves_per_s == 2.5
@@ -182,6 +183,8 @@ def test_the_public_interface_asks_too(hub: str) -> None:
             pipeline.set_solving(-1)
         with pytest.raises(fieldpose.FieldposeError, match="frames are not followed here"):
             pipeline.set_solving(1)
+        with pytest.raises(fieldpose.FieldposeError, match="there is no keyframe to take"):
+            pipeline.take_keyframe()
         assert pipeline.values().requests == 2
 
 
@@ -262,7 +265,12 @@ def test_in_real_processes_tracking_begins_again_and_finds_the_pose(
 
             assert main(["control", "solve", "0", "--connect", hub, "--timeout-s", str(ENOUGH_S)]) == 0
             assert "solved at least 0 times a second, begins at a guess, 3 requests" in capsys.readouterr().out
-            assert sender.send().state is TrackingState.TRACKING
+            followed = sender.send()
+            assert followed.state is TrackingState.TRACKING
+
+            assert main(["control", "keyframe", "--connect", hub, "--timeout-s", str(ENOUGH_S)]) == 0
+            while not pipeline.values().keyframes:
+                sender.send()
     finally:
         run.send_signal(signal.SIGINT)
         _, complaint = run.communicate(timeout=60)
@@ -270,6 +278,8 @@ def test_in_real_processes_tracking_begins_again_and_finds_the_pose(
     assert not any(process.is_running() for process in processes)
     assert info(recording).lossless
     said = [cast(Control, each.message) for each in read_recording(recording, (CONTROL,))]
-    assert [each.request for each in said] == ["reset", "set_guess", "set_solving"]
+    assert [each.request for each in said] == ["reset", "set_guess", "set_solving", "take_keyframe"]
     states = [cast(State, each.message) for each in read_recording(recording, (STATE,))]
-    assert [said[0].after_frame, said[-1].after_frame] == [reset.header.frame_id - 1, states[-1].header.frame_id - 1]
+    asked_after = [reset.header.frame_id - 1, followed.header.frame_id - 1, followed.header.frame_id]
+    assert [said[0].after_frame, said[2].after_frame, said[3].after_frame] == asked_after
+    assert states[-1].header.frame_id > followed.header.frame_id

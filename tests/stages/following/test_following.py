@@ -14,7 +14,7 @@ from fieldpose.stages.alignment.landmarks import landmarks
 from fieldpose.stages.alignment.placing import Warped, warped
 from fieldpose.stages.alignment.views import ViewPoints
 from fieldpose.stages.following.choice import chosen_points
-from fieldpose.stages.following.config import LEVELS, FollowingConfig
+from fieldpose.stages.following.config import KEYFRAMES, LEVELS, FollowingConfig
 from fieldpose.stages.following.core import Followed, Follower
 from fieldpose.stages.geometry import exp_se3, inverse, log_se3, perturb, rotation_error_deg, translation_error
 
@@ -215,6 +215,20 @@ def test_views_beyond_the_capacity_are_forgotten_the_longest_unused_first() -> N
     add_view(follower, "2", VIEWPOINTS[2])
     assert [view_id in follower for view_id in "012"] == [True, False, True]
     assert len(follower) == 2
+
+
+def test_a_view_that_is_kept_stays_whatever_comes_after_it_until_too_many_are() -> None:
+    follower = remembering(VIEWPOINTS[0], views=1)
+    follower.keep("0")
+    follower.keep("unknown")
+    for number in range(1, KEYFRAMES + 1):
+        add_view(follower, str(number), VIEWPOINTS[1])
+        assert ("0" in follower, follower.keyframes) == (True, number)
+        if number < KEYFRAMES:
+            follower.keep(str(number))
+    assert follower.angle(VIEWPOINTS[0]) < 1e-3
+    follower.keep(str(KEYFRAMES))
+    assert ("0" in follower, follower.keyframes, len(follower)) == (False, KEYFRAMES, KEYFRAMES)
 
 
 def test_a_view_that_is_added_twice_is_one() -> None:

@@ -14,7 +14,7 @@ from support.tracking_world import CAMERA, MS, World, frame_info, hand_held, on_
 from fieldpose.bus.codec import decode, encode
 from fieldpose.bus.messages import CameraInfo, Control, GuessReason, Message, Reason, State, TrackingState
 from fieldpose.bus.node import first_header
-from fieldpose.bus.requests import ControlValues, Request, Reset, SetGuess, SetSolving, Show
+from fieldpose.bus.requests import ControlValues, Request, Reset, SetGuess, SetSolving, Show, TakeKeyframe
 from fieldpose.bus.topics import CAMERA_INFO, CONTROL, STATE
 from fieldpose.errors import RefusedError
 from fieldpose.stages.following.config import FollowingConfig
@@ -24,7 +24,7 @@ from fieldpose.stages.tracking.config import TrackingConfig
 from fieldpose.stages.tracking.control import Controls
 from fieldpose.stages.tracking.core import Counts, GuessOrder, LookOrder, StateReport, Tracker
 from fieldpose.stages.tracking.followed import FollowedPolicy
-from fieldpose.stages.tracking.following import FollowingTracker
+from fieldpose.stages.tracking.following import FollowedReport, FollowingTracker
 from fieldpose.stages.tracking.node import TrackingNode
 from fieldpose.stages.tracking.photos import PhotoPolicy
 from fieldpose.stages.tracking.policy import Alike, FrameInfo, PoseResult
@@ -269,6 +269,45 @@ class TestFollowed:
         assert 8 <= solved_in(2.0) <= 10
         assert Followed(self.near, solve_ms=0.0).tracker.solves_per_s == 100.0
 
+    def test_a_keyframe_is_solved_at_once_from_where_it_was_followed_and_its_view_is_kept(self) -> None:
+        video = Followed(self.near, fresh_deg=60.0, solve_ms=np.inf)
+        video.begun(self.pose)
+        assert guesses(video.frame(self.pose)) == []
+        video.tracker.take_keyframe()
+        (order,) = guesses(said := video.frame(self.pose))
+        (measured,) = [each.followed for each in said if isinstance(each, FollowedReport)]
+        np.testing.assert_array_equal(order.guess.cam_from_object, measured.cam_from_object)
+        assert video.tracker.keyframes == 0
+        video.solved(order, self.pose)
+        assert video.tracker.keyframes == 1
+        assert guesses(video.frame(self.pose)) == []
+        video.tracker.restart(None, 0)
+        assert video.tracker.keyframes == 1
+
+    def test_a_keyframe_that_the_solve_does_not_bear_out_is_not_kept(self) -> None:
+        video = Followed(self.near, fresh_deg=60.0, solve_ms=np.inf)
+        video.begun(self.pose)
+        video.tracker.take_keyframe()
+        (order,) = guesses(video.frame(self.pose))
+        video.solved(order, viewpoint(30, 35))
+        assert video.tracker.keyframes == 0
+
+    def test_a_keyframe_needs_a_track_and_is_forgotten_by_a_reset(self) -> None:
+        video = Followed(self.near, fresh_deg=60.0, solve_ms=np.inf)
+        with pytest.raises(RefusedError, match="not tracked"):
+            video.tracker.take_keyframe()
+        video.begun(self.pose)
+        video.tracker.take_keyframe()
+        video.tracker.restart(self.pose, 0)
+        video.begun(self.pose)
+        assert guesses(video.frame(self.pose)) == []
+        assert video.tracker.keyframes == 0
+
+
+PHOTOS_TAKE_NONE = [
+    Reset(), SetGuess(cam_from_object=ELSEWHERE), SetSolving(solves_per_s=1.0), TakeKeyframe(),
+]  # fmt: skip
+
 
 class TestControls:
     def asked(self, tracker: Tracker | FollowingTracker, request: Request) -> tuple[ControlValues, list[Message]]:
@@ -295,7 +334,7 @@ class TestControls:
         assert (values.state, values.frames, values.requests, values.solves_per_s) == (INITIALIZING, 0, 0, 1.0)
         assert values.begins_at is None
 
-    @pytest.mark.parametrize("request_", [Reset(), SetGuess(cam_from_object=ELSEWHERE), SetSolving(solves_per_s=1.0)])
+    @pytest.mark.parametrize("request_", PHOTOS_TAKE_NONE)
     def test_photos_take_none_of_it(self, request_: Request) -> None:
         settings = TrackingConfig()
         tracker = Tracker(settings, PhotoPolicy(settings, VIEWS, Priors(), START))
@@ -307,8 +346,16 @@ class TestControls:
         assert controls.carry_out(Show(), 0)[0].requests == 0
 
     def test_where_frames_are_not_followed_there_is_no_rate(self) -> None:
-        with pytest.raises(RefusedError, match="frames are not followed here"):
-            Controls(video_tracker()).carry_out(SetSolving(solves_per_s=1.0), 0)
+        for request in (SetSolving(solves_per_s=1.0), TakeKeyframe()):
+            with pytest.raises(RefusedError, match="frames are not followed here"):
+                Controls(video_tracker()).carry_out(request, 0)
+
+    def test_a_keyframe_that_is_taken_is_said(self) -> None:
+        video = Followed(TestFollowed.near)
+        video.begun(TestFollowed.pose)
+        values, (control,) = self.asked(video.tracker, TakeKeyframe())
+        assert isinstance(control, Control)
+        assert (control.request, values.keyframes, values.requests) == ("take_keyframe", 0, 1)
 
 
 def test_the_node_says_what_it_did_and_how_the_frames_ended_that_it_forgot() -> None:

@@ -37,8 +37,8 @@ class ControlValues(Response, kw_only=True):
     state: of the newest frame, INITIALIZING before the first and after a reset. frames: how many have come; requests:
     how many that change something were carried out. solves_per_s: how often a frame is solved at least, at most 100;
     None where frames are not followed. begins_at: (4, 4) where tracking begins when nothing is known of the camera;
-    None where training views are tried, and where frames stand each by itself. keyframes: how many views are kept
-    because that was asked for; None where frames are not followed.
+    None where training views are tried, and where frames stand each by itself. keyframes: of how many frames the
+    view was kept because that was asked for, of which the newest eight are there; None where frames are not followed.
     """
 
     state: TrackingState

@@ -111,8 +111,8 @@ class Connection:
     def take_keyframe(self, timeout_s: float = 5.0) -> ControlValues:
         """Have the next frame that is followed well solved at once, and its view kept if the solve bears that out.
 
-        The answer comes before; `values().keyframes` grows, up to eight, once it is kept. Raises FieldposeError where
-        the camera is not tracked, where frames are not followed, or without an answer.
+        The answer comes before; `values().keyframes` grows once it is kept, as the newest eight are. Raises
+        FieldposeError where the camera is not tracked, where frames are not followed, or without an answer.
         """
         return self._ask(TakeKeyframe(), timeout_s)
 

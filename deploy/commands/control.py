@@ -118,7 +118,7 @@ def in_words(values: ControlValues) -> str:
     words = [str(values.state), f"{values.frames} frames"]
     words.append("not followed" if rate is None else f"solved at least {rate:g} times a second")
     if values.keyframes:
-        words.append(f"{values.keyframes} keyframe{'s' * (values.keyframes > 1)} kept")
+        words.append(f"{values.keyframes} keyframe{'s' * (values.keyframes > 1)} taken")
     if values.begins_at is not None:
         words.append("begins at a guess")
     return ", ".join([*words, f"{values.requests} requests carried out"])

@@ -5,40 +5,38 @@ from __future__ import annotations
 import dataclasses
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from socket import AF_INET
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
+import psutil
 import tyro
 
-from fieldpose.bus.ports import Inbox
-from fieldpose.bus.replay import info
+from fieldpose.bus.replay import RecordingInfo, info
 from fieldpose.bus.signals import StopSignals
-from fieldpose.bus.topics import FRAME, STATE, Address
+from fieldpose.bus.topics import Address
 from fieldpose.bus.transport import LOCAL_HUB
-from fieldpose.connection import Connection
 from fieldpose.deploy.access.joining import Entry, joined
 from fieldpose.deploy.access.roles import OPERATOR, VIEWER
 from fieldpose.deploy.reporting.provenance import pipelines_in, recorded_field
-from fieldpose.deploy.viewing.moments import WATCHED, Moment, Moments
+from fieldpose.deploy.viewing.asking import Actions, actions_on
 from fieldpose.deploy.viewing.recorded import RecordedMoments
-from fieldpose.errors import FieldposeError, UsageError
-from fieldpose.stages.nerf.field import Field, load_field
+from fieldpose.errors import RecordingError, UsageError
+from fieldpose.stages.nerf.field import Field, load_field, load_metadata
 from fieldpose.stages.nerf.loading import make_renderer
 from fieldpose.stages.nerf.surface.samples import sampled_surface
 
 if TYPE_CHECKING:
-    from fieldpose.deploy.viewing.page import Actions, Page
+    from fieldpose.deploy.viewing.page import Page
 
-_HUB_S, _ASK_S = 60.0, 3.0
+_HUB_S = 60.0
 _PICTURES_HZ = 10.0
-_RATE_S = 3.0
 _NICE = 10
 """Lower than what tracks: the page is what waits, where there are too few cores."""
-_QUEUED, _IMAGES = 512, 8
+_THIS_MACHINE = ("127.0.0.1", "localhost")
 
 
 @dataclass(frozen=True)
@@ -75,73 +73,80 @@ class Options:
         """Serve until Ctrl-C."""
         if not 1 <= self.port <= 65535:
             raise UsageError(f"--port {self.port}: expected 1 to 65535")
-        os.nice(_NICE)
+        if self.what.name.endswith(".mcap.partial"):
+            whole = self.what.with_suffix("")
+            raise UsageError(f"{self.what}: unfinished; `fieldpose recover {self.what} --out {whole}` mends it")
         return self._recording() if self.what.suffix == ".mcap" else self._live()
 
     def _recording(self) -> int:
         recording = info(self.what)
         with TemporaryDirectory(prefix="fieldpose-") as folder:
             pipeline = self.pipeline if pipelines_in(recording) else None
-            path = self.field or recorded_field(self.what, recording, Path(folder), pipeline)
-            field = load_field(path)
+            path = self._field_of(recording, Path(folder), pipeline)
             moments = RecordedMoments(self.what, self.pipeline)
-            page = self._page(field, f"{self.what.name}")
-            page.add_timeline(len(moments))
-            page.note(moments.all)
+            page = self._page(load_field(path), self.what.name)
+            page.add_timeline(len(moments), moments.after)
+            page.plot(moments.history)
             self._say(page)
-            shown = -1
+            shown, way_of = -1, -1
 
             def update() -> None:
-                nonlocal shown
+                nonlocal shown, way_of
                 if not page.watched:
                     return
                 chosen = page.chosen()
                 if chosen != shown or page.asked_otherwise():
                     shown = chosen
                     page.show(moments.at(shown), moments.way(shown), None)
+                elif way_of != shown:
+                    way_of = shown
+                    page.draw_way(moments.way(shown))
 
             return self._serve(page, update)
+
+    def _field_of(self, recording: RecordingInfo, folder: Path, pipeline: str | None) -> Path:
+        """Raises UsageError where another field is asked for than the recorded poses are of, in another frame."""
+        if self.field is None:
+            return recorded_field(self.what, recording, folder, pipeline)
+        try:
+            recorded = load_metadata(recorded_field(self.what, recording, folder, pipeline)).frame
+        except RecordingError:
+            return self.field
+        if load_metadata(self.field).frame != recorded:
+            raise UsageError(
+                f"--field {self.field}: its frame is another than that of the recorded poses (see `fieldpose frame`);"
+                " view the recording without --field, or replay it with this field and view that"
+            )
+        return self.field
 
     def _live(self) -> int:
         field = load_field(self.what)
         with joined(self.connect, self.entry, (OPERATOR, VIEWER), _HUB_S) as bus:
-            inbox = Inbox(
-                bus, self.address, WATCHED, {topic: _IMAGES if topic is FRAME else _QUEUED for topic in WATCHED}
-            )
-            page = self._page(field, self.address.pair, self._actions())
+            page = self._page(field, self.address.pair, actions_on(bus, self.address))
             self._say(page)
-            return self._serve(page, _Live(inbox, page).update)
+            # It brings what serves pages, which takes a while.
+            from fieldpose.deploy.viewing.live import Live
+
+            live = Live(bus, self.address, page)
+            try:
+                return self._serve(page, live.update)
+            finally:
+                live.close()
 
     def _page(self, field: Field, title: str, actions: Actions | None = None) -> Page:
-        # It brings what serves pages, which takes a while.
-        from fieldpose.deploy.viewing.page import Actions, Page
+        from fieldpose.deploy.viewing.page import Page
 
+        os.nice(_NICE)
         renderer = make_renderer(field, 1)
         surface = sampled_surface(renderer, field.metadata)
-        return Page(self.host, self.port, title, field.metadata, renderer, surface, actions or Actions())
-
-    def _actions(self) -> Actions:
-        from fieldpose.deploy.viewing.page import Actions
-
-        def asked(do: Callable[[Connection], object]) -> str:
-            try:
-                with Connection(self.connect, self.address, _ASK_S, self.entry, (OPERATOR, VIEWER)) as pipeline:
-                    do(pipeline)
-            except FieldposeError as error:
-                return f"not done: {error}"
-            return "done"
-
-        def reset() -> str:
-            return asked(lambda pipeline: pipeline.reset(timeout_s=_ASK_S))
-
-        def guess(cam_from_object: np.ndarray) -> str:
-            return asked(lambda pipeline: pipeline.reset(cam_from_object, _ASK_S))
-
-        return Actions(reset, guess)
+        return Page(self.host, self.port, title, field.metadata, renderer, surface, actions)
 
     def _say(self, page: Page) -> None:
-        shown = "127.0.0.1" if self.host == "0.0.0.0" else self.host
-        print(f"http://{shown}:{page.port} shows it; Ctrl-C ends this", flush=True)
+        print(f"http://127.0.0.1:{page.port} shows it; Ctrl-C ends this", flush=True)
+        if self.host not in _THIS_MACHINE:
+            hosts = own_addresses() if self.host == "0.0.0.0" else [self.host]
+            others = ", ".join(f"http://{host}:{page.port}" for host in hosts)
+            print(f"from other machines, a phone for instance: {others or 'this machine has no address'}", flush=True)
 
     def _serve(self, page: Page, update: Callable[[], None]) -> int:
         end = None if self.seconds is None else time.monotonic() + self.seconds
@@ -154,33 +159,7 @@ class Options:
         return 0
 
 
-class _Live:
-    """Passes on what a running pipeline says, where somebody looks."""
-
-    def __init__(self, inbox: Inbox, page: Page) -> None:
-        self._inbox, self._page = inbox, page
-        self._moments = Moments()
-        self._shown: tuple[int, int] | None = None
-        self._noted = 0
-        self._came: list[float] = []
-
-    def update(self) -> None:
-        for received in self._inbox.drain():
-            self._moments.note(received.message)
-            if received.topic is STATE:
-                self._came.append(time.monotonic())
-        now = time.monotonic()
-        self._came = [at for at in self._came if at > now - _RATE_S]
-        self._page.note(self._new())
-        newest = self._moments.newest()
-        if newest is None or not self._page.watched:
-            return
-        key = newest.frame_id, newest.capture_ns
-        if key != self._shown:
-            self._shown = key
-            self._page.show(newest, self._moments.way, len(self._came) / _RATE_S)
-
-    def _new(self) -> Sequence[Moment]:
-        fresh = [moment for moment in self._moments.answered() if moment.capture_ns > self._noted]
-        self._noted = max((moment.capture_ns for moment in fresh), default=self._noted)
-        return fresh
+def own_addresses() -> list[str]:
+    """IPv4 addresses under which other machines may reach this one."""
+    found = (address for addresses in psutil.net_if_addrs().values() for address in addresses)
+    return sorted(each.address for each in found if each.family == AF_INET and not each.address.startswith("127."))

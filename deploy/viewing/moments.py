@@ -31,7 +31,10 @@ _FEW = 0.5
 
 @dataclass(frozen=True)
 class Moment:
-    """One frame: its image where that has come, and what was said of it; lifted: the points of the newest solve."""
+    """One frame: its image where that has come, and what was said of it.
+
+    lifted: the points of the newest solve; solving: whether a pose was guessed for it, to be solved.
+    """
 
     frame_id: int
     capture_ns: int
@@ -41,6 +44,7 @@ class Moment:
     state: State | None = None
     followed: Followed | None = None
     lifted: Correspondences | None = None
+    solving: bool = False
 
     @property
     def latency_ms(self) -> float | None:
@@ -71,15 +75,20 @@ class Moments:
         self._kept = kept
         self._moments: OrderedDict[tuple[int, int], Moment] = OrderedDict()
         self._lifted: Correspondences | None = None
+        self._numbers: dict[str, int] = {}
         self.way: list[tuple[np.ndarray, TrackingState]] = []
 
     def note(self, message: Message) -> None:
-        """Take in one of the topics WATCHED."""
+        """Take in one of the topics WATCHED. A camera that begins again may number its frames as it did before."""
+        if isinstance(message, CameraInfo | State) and self._began_again(message):
+            self._moments.clear() if isinstance(message, CameraInfo) else self.way.clear()
         match message:
             case Frame():
                 self._set(message.header, frame=message, camera=message.camera, sent_ns=message.header.sent_ns)
             case CameraInfo():
-                self._set(message.header, camera=message.camera, sent_ns=message.header.sent_ns)
+                known = self._moments.get(message.header.frame_key)
+                sent_ns = known.sent_ns if known is not None and known.sent_ns is not None else message.header.sent_ns
+                self._set(message.header, camera=message.camera, sent_ns=sent_ns)
             case Followed():
                 self._set(message.header, followed=message)
             case Correspondences():
@@ -90,6 +99,11 @@ class Moments:
                 if known.place is not None:
                     self.way.append(known.place)
                     del self.way[:-_WAY]
+
+    def note_solving(self, header: Header) -> None:
+        """Take in that a frame is being solved, so that its image is shown with what comes of it."""
+        if header.frame_key in self._moments:
+            self._set(header, solving=True)
 
     def newest(self, with_image: bool = True) -> Moment | None:
         """The newest frame that there is a state of, and an image; with the points of the newest solve."""
@@ -103,9 +117,18 @@ class Moments:
         return (moment for moment in self._moments.values() if moment.state is not None)
 
     def _let_images_go(self) -> None:
-        with_image = [key for key, moment in self._moments.items() if moment.frame is not None]
-        for key in with_image[:-_IMAGES]:
-            self._moments[key] = replace(self._moments[key], frame=None)
+        """Of all frames but the newest, and but for those that are being solved, the newest of them."""
+        held = [(key, moment) for key, moment in self._moments.items() if moment.frame is not None]
+        solving = [key for key, moment in held if moment.solving and moment.state is None][-_IMAGES:]
+        for key, _ in held[:-_IMAGES]:
+            if key not in solving:
+                self._moments[key] = replace(self._moments[key], frame=None)
+
+    def _began_again(self, message: Message) -> bool:
+        """Whether the sender of a topic counts from 0 again."""
+        kind, number = type(message).__name__, message.header.sequence
+        before, self._numbers[kind] = self._numbers.get(kind, -1), number
+        return number < before
 
     def _set(self, header: Header, **known: object) -> Moment:
         key = header.frame_key

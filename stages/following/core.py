@@ -75,6 +75,7 @@ class Follower:
         self._config = config
         self._views: LRUCache[str, ViewPoints] = LRUCache(config.views)
         self._keyframes: FIFOCache[str, ViewPoints] = FIFOCache(KEYFRAMES)
+        self._kept = 0
 
     def __contains__(self, view_id: str) -> bool:
         return view_id in self._views or view_id in self._keyframes
@@ -84,8 +85,8 @@ class Follower:
 
     @property
     def keyframes(self) -> int:
-        """How many views are kept, whatever is seen after them."""
-        return len(self._keyframes)
+        """How many views were kept so far; the newest KEYFRAMES of them are there, whatever is seen after them."""
+        return self._kept
 
     @property
     def _all(self) -> dict[str, ViewPoints]:
@@ -105,6 +106,7 @@ class Follower:
         view = self._views.get(view_id)
         if view is not None:
             self._keyframes[view_id] = view
+            self._kept += 1
 
     def angle(self, cam_from_object: Transform) -> float:
         """How differently, in radians, the nearest view has seen what a camera there sees; infinite without any."""

@@ -123,7 +123,7 @@ class FollowingTracker:
 
     @property
     def keyframes(self) -> int | None:
-        """How many views are kept because that was asked for."""
+        """How many views were kept because that was asked for."""
         return self._policy.follower.keyframes
 
     def take_keyframe(self) -> None:

@@ -6,27 +6,36 @@ import os
 import re
 import signal
 import subprocess
+import threading
 from collections.abc import Iterator
+from itertools import cycle
 from pathlib import Path
+from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
 from support import bus_samples
-from support.browser import Browser, needs_browser
+from support.browser import PHONE, Browser, needs_browser
 from support.commands import command, fieldpose
 
-from fieldpose.bus.messages import Followed, Reason, State, TrackingState
+import fieldpose as fieldpose_api
+from fieldpose.bus.messages import CameraInfo, Followed, Frame, Reason, State, TrackingState
 from fieldpose.bus.ports import first_header
+from fieldpose.bus.replay import read_recording
+from fieldpose.bus.topics import FRAME
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.viewing.drawing import FOUND_RGB, LOST_RGB, OVERLAYS, drawn
 from fieldpose.deploy.viewing.moments import Moments, told
-from fieldpose.deploy.viewing.page import ellipsoid
 from fieldpose.deploy.viewing.recorded import RecordedMoments
+from fieldpose.deploy.viewing.scene import ellipsoid, up_direction
 from fieldpose.errors import UsageError
 from fieldpose.stages.geometry import camera_centre, exp_se3
+from fieldpose.stages.nerf.field import load_metadata
 from fieldpose.stages.nerf.loading import load_renderer
 
+ENOUGH_S = 20.0
 SAID = "(document.body?.innerText ?? '')"
 
 
@@ -72,6 +81,37 @@ def test_images_of_old_frames_are_let_go_and_old_frames_too() -> None:
     assert [moment.frame_id for moment in kept if moment.frame is not None] == list(range(42, 50))
 
 
+def sent(message: Any, sequence: int) -> Any:
+    message.header = msgspec.structs.replace(message.header, sequence=sequence)
+    return message
+
+
+def test_the_image_of_a_frame_that_is_being_solved_waits_for_its_state() -> None:
+    """Where every frame is solved, states come long after newer frames have."""
+    moments = Moments()
+    for frame_id in range(50):
+        moments.note(bus_samples.frame(frame_id))
+        if frame_id == 3:
+            moments.note_solving(bus_samples.frame(frame_id).header)
+    moments.note(state(3))
+    newest = moments.newest()
+    assert newest is not None
+    assert newest.frame_id == 3
+
+
+def test_a_camera_that_begins_again_with_the_same_numbers_and_times_is_shown_anew() -> None:
+    moments = Moments()
+    for round_ in range(2):
+        for frame_id in range(20):
+            frame = bus_samples.frame(frame_id)
+            moments.note(sent(CameraInfo(header=frame.header, camera=frame.camera), frame_id))
+            moments.note(sent(frame, frame_id))
+            moments.note(sent(state(frame_id), frame_id))
+            newest = moments.newest()
+            assert newest is not None
+            assert (newest.frame_id, len(moments.way)) == (frame_id, frame_id + 1), round_
+
+
 @pytest.mark.parametrize(
     ("message", "words"),
     [
@@ -111,6 +151,10 @@ def test_a_recording_is_shown_frame_by_frame(recording: Path) -> None:
     assert moment.frame.header.frame_id == moment.frame_id
     assert moment.lifted is not None
     assert 0.3 * middle < len(moments.way(middle)) <= middle + 1
+    assert len(moments.way(0)) <= 1
+    assert moments.after(middle, 0.001) == middle + 1
+    assert moments.seconds[moments.after(middle, 1.0)] == pytest.approx(moments.seconds[middle] + 1, abs=0.1)
+    assert moments.after(len(moments) - 1, 1.0) == 0
     plain = drawn(moment, renderer, "none", points=False)
     assert plain is not None
     for overlay in OVERLAYS[:-1]:
@@ -167,25 +211,81 @@ def test_a_browser_shows_a_recording(recording: Path, tmp_path: Path, ended: lis
     assert (tmp_path / "page.png").stat().st_size > 50_000
 
 
+BUTTON = "[...document.querySelectorAll('button')].find((each) => each.innerText == '{}')"
+WIDEST = "Math.max(...[...document.querySelectorAll('body *')].map((each) => each.getBoundingClientRect().right))"
+
+
 @needs_browser
-def test_a_browser_shows_a_run_live(tmp_path: Path) -> None:
-    sequence, field = demo_file("sequence.mcap"), demo_file("field.safetensors")
-    process = subprocess.Popen(
-        command("run", field, "--source", f"mcap:{sequence}", "--view", "--pace", "live"), cwd=tmp_path,
+def test_a_recording_on_a_phone(recording: Path, tmp_path: Path, ended: list[subprocess.Popen[str]]) -> None:
+    process, url = serving(recording, folder=tmp_path)
+    ended.append(process)
+    with Browser(url, tmp_path / "profile", phone=True) as browser:
+        browser.wait_for(f"{SAID}.includes('frame 0')")
+        # As wide as the screen allows, and nothing beyond it.
+        shown = "[...document.images].filter((image) => image.naturalWidth > 300)"
+        browser.wait_for(f"{shown}.some((image) => image.getBoundingClientRect().width > 0.9 * {PHONE[0]})")
+        assert browser.ask(WIDEST) <= PHONE[0]
+        said = browser.ask(SAID)
+        for words in ("play", "each stage of a solve", "rendering", "camera frames", "dropped at the door"):
+            assert words in said
+        assert browser.ask("Object.keys(window.__viserTestpoints.uplots).length") == 5
+        # A touch on the title folds what hides the scene.
+        assert browser.ask(f"document.elementFromPoint({PHONE[0] // 2}, {PHONE[1] // 2 + 50}).tagName") != "CANVAS"
+        titles = f"[...document.querySelectorAll('div')].filter((each) => each.innerText == '{recording.name}')"
+        browser.tap(f"{titles}.pop()")
+        browser.wait_for(f"document.elementFromPoint({PHONE[0] // 2}, {PHONE[1] // 2 + 50}).tagName == 'CANVAS'")
+
+
+def sent_again_and_again(hub: str, stop: threading.Event) -> None:
+    """The frames of the demo's sequence, there and back, until `stop`."""
+    frames = [cast(Frame, each.message) for each in read_recording(demo_file("sequence.mcap"), (FRAME,))]
+    with fieldpose_api.connect(hub, timeout_s=ENOUGH_S) as pipeline:
+        for frame in cycle([*frames, *frames[-2:0:-1]]):
+            if stop.wait(0.05):
+                return
+            pipeline.publish(frame.image, frame.camera, encoding=frame.encoding)
+
+
+@needs_browser
+def test_a_phone_shows_a_run_live_and_asks_something_of_it(tmp_path: Path) -> None:
+    run = subprocess.Popen(
+        command("run", demo_file("field.safetensors"), "--source", "bus", "--view"), cwd=tmp_path,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip
+    stop, sending = threading.Event(), None
     try:
-        assert process.stdout is not None
-        url = next(found.group() for line in process.stdout if (found := re.search(r"http://127[\d.]+:\d+", line)))
-        with Browser(url, tmp_path / "profile") as browser:
+        assert run.stdout is not None
+        printed = ""
+        while not ("http" in printed and "running" in printed):
+            printed += run.stdout.readline()
+        hub, url = (re.search(pattern, printed) for pattern in (r"hub (tcp\S+)", r"http://127[\d.]+:\d+"))
+        assert hub is not None
+        assert url is not None
+        with Browser(url.group(), tmp_path / "profile", phone=True) as browser:
+            browser.wait_for(f"{SAID}.includes('object/camera0 is running; waiting for a frame')")
+            sending = threading.Thread(target=sent_again_and_again, args=(hub.group(1), stop))
+            sending.start()
             browser.wait_for(f"/tracking; \\d+ of \\d+ points found/.test({SAID})", 60)
-            assert "begin again" in browser.ask(SAID)
-        out, _ = process.communicate(timeout=60)
-        assert process.returncode == 0, out
+            assert browser.ask(f"{BUTTON.format('save the last 10 s')}.disabled")
+            assert "Saving needs a recorder" in browser.ask(SAID)
+            browser.tap(BUTTON.format("take a keyframe"))
+            browser.wait_for(f"{SAID}.includes('view is kept')")
+            browser.tap(BUTTON.format("begin again"))
+            browser.wait_for(f"{SAID}.includes('Tracking begins again.')")
+            browser.wait_for(f"/tracking; \\d+ of \\d+ points found/.test({SAID})", 60)
+            browser.wait_for(f"{SAID}.includes('camera frames')")
+            stop.set()
+            browser.wait_for(f"{SAID}.includes('Nothing has come for')")
+        run.send_signal(signal.SIGINT)
+        out, _ = run.communicate(timeout=60)
+        assert run.returncode == 0, out
     finally:
-        if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
+        stop.set()
+        if sending is not None:
+            sending.join()
+        if run.poll() is None:
+            os.killpg(run.pid, signal.SIGKILL)
+            run.wait()
 
 
 def test_what_cannot_be_shown_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -193,6 +293,30 @@ def test_what_cannot_be_shown_is_refused(tmp_path: Path, capsys: pytest.CaptureF
     assert "cannot be read" in capsys.readouterr().err
     assert main(["view", str(demo_file("field.safetensors")), "--port", "0"]) == 2
     assert "expected 1 to 65535" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("ups", "expected"),
+    [
+        ([], (0, 0, 1)),
+        ([(0, 1, 0), (0.3, 1, 0), (-0.3, 1, 0.2)], (0, 1, 0)),
+        ([(0, 0, -1)], (0, 0, -1)),
+        ([(1, 1, 1)], (3**-0.5, 3**-0.5, 3**-0.5)),
+        ([(1, 0, 0), (-1, 0, 0)], (0, 0, 1)),
+    ],
+)
+def test_the_scene_stands_as_the_cameras_were_held(ups: list[Any], expected: tuple[float, ...]) -> None:
+    metadata = load_metadata(demo_file("field.safetensors"))
+    cameras = []
+    for up in np.array(ups, float).reshape(-1, 3):
+        pose = np.eye(4)
+        pose[1, :3] = -up / np.linalg.norm(up)
+        pose[0, :3] = np.cross(pose[1, :3], np.roll(pose[1, :3], 1) + np.array([0.1, 0.2, 0.4]))
+        pose[0, :3] /= np.linalg.norm(pose[0, :3])
+        pose[2, :3] = np.cross(pose[0, :3], pose[1, :3])
+        cameras.append(msgspec.structs.replace(metadata.cameras[0], cam_from_object=tuple(pose.ravel().tolist())))
+    held = up_direction(msgspec.structs.replace(metadata, cameras=cameras))
+    np.testing.assert_allclose(held, expected, atol=1e-9)
 
 
 def test_the_ellipsoid_is_where_the_camera_may_be() -> None:

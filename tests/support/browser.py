@@ -17,6 +17,7 @@ from websockets.sync.client import connect
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
+PHONE = (390, 844)
 _FLAGS = (
     "--headless", "--no-sandbox", "--no-first-run", "--hide-scrollbars", "--use-gl=angle", "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader", "--remote-debugging-port=0",
@@ -24,15 +25,31 @@ _FLAGS = (
 
 
 class Browser:
-    """One page in Chromium, drawn by software; `profile` is a folder of its own."""
+    """One page in Chromium, drawn by software; `profile` is a folder of its own. phone: as on a phone held upright."""
 
-    def __init__(self, url: str, profile: Path, width: int = 1400, height: int = 900) -> None:
-        arguments = [str(CHROMIUM), *_FLAGS, f"--window-size={width},{height}", f"--user-data-dir={profile}", url]
+    def __init__(
+        self, url: str, profile: Path, width: int = 1400, height: int = 900, phone: bool = False
+    ) -> None:  # fmt: skip
+        arguments = [str(CHROMIUM), *_FLAGS, f"--window-size={width},{height}", f"--user-data-dir={profile}"]
+        arguments.append("about:blank" if phone else url)
         self._process = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         port = int(_when_there(profile / "DevToolsActivePort").splitlines()[0])
         pages = _until(lambda: [p for p in _json(f"http://127.0.0.1:{port}/json/list") if p["type"] == "page"])
         self._socket = connect(pages[0]["webSocketDebuggerUrl"], max_size=1 << 28)
         self._number = 0
+        if phone:
+            width, height = PHONE
+            screen = {"width": width, "height": height, "deviceScaleFactor": 2, "mobile": True}
+            self._call("Emulation.setDeviceMetricsOverride", **screen)
+            self._call("Emulation.setTouchEmulationEnabled", enabled=True)
+            self._call("Page.navigate", url=url)
+
+    def tap(self, element: str) -> None:
+        """Touch the middle of what a script gives, scrolled to where it is seen."""
+        box = f"(() => {{ const e = {element}; e.scrollIntoView({{block: 'center'}}); const r ="
+        x, y = self.wait_for(f"{box} e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; }})()")
+        self._call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
+        self._call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
 
     def ask(self, script: str) -> Any:
         """The value of a script in the page."""

@@ -228,7 +228,7 @@ def test_a_view_that_is_kept_stays_whatever_comes_after_it_until_too_many_are() 
             follower.keep(str(number))
     assert follower.angle(VIEWPOINTS[0]) < 1e-3
     follower.keep(str(KEYFRAMES))
-    assert ("0" in follower, follower.keyframes, len(follower)) == (False, KEYFRAMES, KEYFRAMES)
+    assert ("0" in follower, follower.keyframes, len(follower)) == (False, KEYFRAMES + 1, KEYFRAMES)
 
 
 def test_a_view_that_is_added_twice_is_one() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ BY_HEADER: tuple[Topic[Any], ...] = (
 IN_FULL: tuple[Topic[Any], ...] = (STATE, STATS)
 _NS = 1_000_000_000
 _UNDER_WAY = 256
-"""Frames, and passes over frames, of which it is remembered when something was last sent."""
+"""Frames, and passes over frames, of which it is remembered when their messages were sent."""
 
 
 @dataclass
@@ -67,7 +68,7 @@ class History:
         self._began_ns: int | None = None
         self._newest = 0
         self._frames: FIFOCache[tuple[int, int], int] = FIFOCache(_UNDER_WAY)
-        self._passes: FIFOCache[tuple[int, int, int], int] = FIFOCache(_UNDER_WAY)
+        self._passes: FIFOCache[tuple[int, int, int], list[tuple[int, str]]] = FIFOCache(_UNDER_WAY)
         self._door: State | None = None
         self._gaps: dict[str, int] = {}
 
@@ -84,13 +85,14 @@ class History:
                 self._frames[header.frame_key] = header.sent_ns
                 second.counts["frames"] += 1
             return
-        of_pass = (*header.frame_key, header.pass_index)
-        before = self._passes.get(of_pass)
-        if topic not in (SEARCH, GUESS) and before is not None:
-            second.stage_ms[header.source].append((header.sent_ns - before) / 1e6)
-        if topic is POSE:
-            second.counts["solves"] += 1
-        self._passes[of_pass] = header.sent_ns
+        sent = self._passes.setdefault((*header.frame_key, header.pass_index), [])
+        sent.append((header.sent_ns, header.source))
+        if topic in (POSE, FAILURE):
+            second.counts["solves"] += topic is POSE
+            # On a busy host they are not received in the order in which they were sent.
+            for (before, _), (now, source) in pairwise(sorted(sent)):
+                second.stage_ms[source].append((now - before) / 1e6)
+            sent.clear()
 
     def note(self, message: Message, received_ns: int) -> None:
         """Take in a message of IN_FULL."""

@@ -145,7 +145,7 @@ class Page:
         gui.main_panel.dock_right()
         self._said = gui.add_html("", order=0)
         self._say("waiting for a frame")
-        self._image = gui.add_image(np.full((120, 160, 3), 40, np.uint8), format="jpeg", order=0.5)
+        self._image = gui.add_image(np.zeros((3, 4, 3), np.uint8), format="jpeg", order=0.5, visible=False)
         if self._actions is not None:
             with gui.add_folder("tracking", order=2):
                 self._add_buttons(self._actions)

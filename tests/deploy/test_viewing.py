@@ -87,8 +87,8 @@ class TestHistory:
             (SEARCH, header(1, 0, "tracking")),
             (RETRIEVED, header(1, 30, "retrieval")),
             (GUESS, header(1, 500, "tracking")),
+            (CORRESPONDENCES, header(1, 570, "lifting")),  # received before what it was made of
             (VIEW, header(1, 550, "rendering")),
-            (CORRESPONDENCES, header(1, 570, "lifting")),
             (POSE, header(1, 575, "refinement")),
             (GUESS, header(1, 600, "tracking", 1)),
             (FAILURE, header(1, 690, "rendering", 1)),

@@ -5,16 +5,18 @@ from __future__ import annotations
 import dataclasses
 import io
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from rich.table import Table
 
-from fieldpose.deploy.reporting.output import check_writable, result_console, write_bytes, write_json
+from fieldpose.deploy.commands.run import INTERRUPTED
+from fieldpose.deploy.evaluation import words
+from fieldpose.deploy.reporting.output import check_writable, write_bytes, write_json
 from fieldpose.deploy.settings import Settings
 from fieldpose.errors import UsageError
 
@@ -29,9 +31,6 @@ if TYPE_CHECKING:
     from fieldpose.stages.nerf.rendering_api import RayRenderer
 
 _WRITTEN_EVERY_S = 60.0
-_COLUMNS = (
-    "method", "pairs", "< 5 deg", "< 0.05", "ok", "right of ok", "RE mean", "median", "TE mean", "median", "s",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -47,11 +46,11 @@ class Options:
     can be compared.
 
     The JSON file, written each minute with what there is and in the end, has: protocol, unit, pairs, seeds, covered,
-    diameter, methods (name -> pairs, share_re_below_5deg, share_te_below_0.05, share_both_below, share_ok,
-    share_ok_right, share_of_solvable, mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te,
-    seconds_per_image, stage_ms, covariance, add), differences (name -> than, and the mean and 95 % interval of how
-    much larger its errors are than that method's, also with errors capped at 20 degrees and 0.2, a missing pose being
-    so wrong).
+    diameter, interrupted (whether it was ended by Ctrl-C, or is not done yet), methods (name -> pairs,
+    share_re_below_5deg, share_te_below_0.05, share_both_below, share_ok, share_ok_right, share_of_solvable,
+    mean_re_deg, median_re_deg, p90_re_deg, mean_te, median_te, p90_te, seconds_per_image, stage_ms, covariance, add),
+    differences (name -> than, and the mean and 95 % interval of how much larger its errors are than that method's,
+    also with errors capped at 20 degrees and 0.2, a missing pose being so wrong).
     """
 
     field: tyro.conf.Positional[Path]
@@ -127,22 +126,37 @@ class Options:
             "diameter": None if surface is None else surface.diameter,
         }
         answers: dict[str, list[Answer]] = {name: [] for name in names}
-        written = time.monotonic()
-        for name, answer in examination.answers(names, self.settings, self.slow_pairs):
-            answers[name].append(answer)
-            if self.json is not None and time.monotonic() - written > _WRITTEN_EVERY_S:
-                write_json(self.json, {**about, **_scores(answers, surface)})
-                written = time.monotonic()
-        figures = {**about, **_scores(answers, surface)}
+        interrupted = not self._fill(answers, examination, about, surface)
+        answers = {name: given for name, given in answers.items() if given}
+        if not answers:
+            return INTERRUPTED
+        figures = {**about, "interrupted": interrupted, **_scores(answers, surface)}
         write_json(self.json, figures)
         if self.plot is not None:
             self._draw(answers, surface, self.plot)
-        _print(figures)
+        words.print_scores(figures)
         if page is not None:
             write_bytes(page, self._page(answers, surface, examination, figures))
             print(f"{page}: a page of the scores")
         _warn_of_training_images(field, dataset)
-        return 0
+        return INTERRUPTED if interrupted else 0
+
+    def _fill(
+        self, answers: Mapping[str, list[Answer]], examination: Examination, about: Mapping[str, Any],
+        surface: Surface | None,
+    ) -> bool:  # fmt: skip
+        """Gather what the methods answer, and write what there is now and then; False where Ctrl-C ended it."""
+        written = time.monotonic()
+        try:
+            with closing(examination.answers(list(answers), self.settings, self.slow_pairs)) as given:
+                for name, answer in given:
+                    answers[name].append(answer)
+                    if self.json is not None and time.monotonic() - written > _WRITTEN_EVERY_S:
+                        write_json(self.json, {**about, "interrupted": True, **_scores(answers, surface)})
+                        written = time.monotonic()
+        except KeyboardInterrupt:
+            return False
+        return True
 
     def _check(self) -> None:
         """Raises UsageError for numbers that mean nothing, and for flags that would do nothing."""
@@ -216,10 +230,10 @@ class Options:
 
         curves = io.BytesIO()
         self._draw(answers, surface, curves)
-        about = [f"looked for with {self.field.name}", *_about(figures)]
-        scores = (_COLUMNS, list(_rows(figures["methods"])))
+        about = [f"looked for with {self.field.name}", *words.about(figures)]
+        scores = (words.COLUMNS, list(words.rows(figures["methods"])))
         settings = differing(self.settings)
-        return html(Evaluation(str(self.dataset), about, scores, _gaps(figures), curves.getvalue(), settings),
+        return html(Evaluation(str(self.dataset), about, scores, words.gaps(figures), curves.getvalue(), settings),
                     answers, examination)  # fmt: skip
 
     def _draw(
@@ -258,73 +272,3 @@ def _scores(answers: Mapping[str, Sequence[Answer]], surface: Surface | None) ->
             name: {"than": other, **difference(answers[name], answers[other])} for name, other in than.items()
         },
     }
-
-
-def _print(figures: dict[str, Any]) -> None:
-    console = result_console()
-    for line in _about(figures):
-        console.print(line, highlight=False)
-    console.print(_table(figures["methods"]))
-    for line in _gaps(figures):
-        console.print(line, highlight=False)
-
-
-def _about(figures: dict[str, Any]) -> list[str]:
-    protocol = figures["protocol"]
-    least, most = protocol["angle_deg"]
-    lines = [
-        f"{figures['pairs']} pairs (seeds {in_short(figures['seeds'])}), lengths in: {figures['unit']}",
-        f"{protocol['name']}: guesses turned by {least:g} to {most:g} degrees about the {protocol['turn_about']}"
-        f" {'or' if protocol['in_turn'] else 'and'} shifted by up to {protocol['max_translation']:.3g}",
-    ]
-    if figures["covered"] is not None:
-        lines.append(f"{figures['covered']:.0%} of the images are covered")
-    return lines
-
-
-def _gaps(figures: dict[str, Any]) -> list[str]:
-    lines = []
-    for name, gap in figures["differences"].items():
-        plain = f"RE {_gap(gap['re_deg'])}, TE {_gap(gap['te'])}"
-        capped = f"capped: RE {_gap(gap['capped_re_deg'])}, TE {_gap(gap['capped_te'])}"
-        lines.append(f"{name} against {gap['than']}: {plain}; {capped}")
-    return lines
-
-
-def in_short(numbers: Sequence[int]) -> str:
-    """Numbers from the least to the greatest, where they are all of these."""
-    low, high = min(numbers), max(numbers)
-    if high > low + 1 and list(numbers) == list(range(low, high + 1)):
-        return f"{low} to {high}"
-    return ", ".join(map(str, numbers))
-
-
-def _table(methods: dict[str, Any]) -> Table:
-    table = Table()
-    for column in _COLUMNS:
-        table.add_column(column, justify="left" if column == "method" else "right")
-    for row in _rows(methods):
-        table.add_row(*row)
-    return table
-
-
-def _rows(methods: dict[str, Any]) -> Iterator[tuple[str, ...]]:
-    """Of each method what _COLUMNS names."""
-    for name, row in methods.items():
-        shares = ("share_re_below_5deg", "share_te_below_0.05", "share_ok", "share_ok_right")
-        errors = (("mean_re_deg", 3), ("median_re_deg", 3), ("mean_te", 5), ("median_te", 5))
-        yield (
-            name,
-            str(row["pairs"]),
-            *(_number(row[share], 3) for share in shares),
-            *(_number(row[error], digits) for error, digits in errors),
-            f"{row['seconds_per_image']:.2f}",
-        )
-
-
-def _gap(gap: dict[str, float] | None) -> str:
-    return "-" if gap is None else f"{gap['mean']:+.3g} ({gap['low']:+.3g} to {gap['high']:+.3g})"
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "-" if value is None else f"{value:.{digits}f}"

@@ -90,7 +90,7 @@ def _framed(axis: Axes, x_label: str, y_label: str) -> None:
 
 
 def _save(drawing: Figure, path: Path | IO[bytes], title: str) -> None:
-    drawing.suptitle(title, fontsize=10)
+    drawing.suptitle(title, fontsize=10, parse_math=False)
     if isinstance(path, Path):
         path.parent.mkdir(parents=True, exist_ok=True)
     drawing.savefig(path, dpi=110)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby, product
 
@@ -35,7 +35,9 @@ class Examination:
     images: Mapping[tuple[int, int], np.ndarray]
     pairs: Sequence[Pair]
 
-    def answers(self, names: Sequence[str], settings: Settings, slow_pairs: int) -> Iterator[tuple[str, Answer]]:
+    def answers(
+        self, names: Sequence[str], settings: Settings, slow_pairs: int
+    ) -> Generator[tuple[str, Answer], None, None]:  # fmt: skip
         """The methods' answers; a slow one gets only `slow_pairs` of the pairs, evenly spread (0: all).
 
         They take turns image by image, so that no method meets the machine in a faster hour than another.

@@ -24,7 +24,8 @@ h1{font-size:1.5rem;line-height:1.25;margin:.5rem 0}h2{font-size:1.1rem;margin:0
 p{margin:.25rem 0 .75rem}.soft{color:var(--soft)}.note{color:var(--bad);font-weight:600}
 section{background:var(--card);border:1px solid var(--line);border-radius:.6rem;padding:1rem;margin:1rem 0}
 img{display:block;max-width:100%;height:auto;border-radius:.3rem}
-.wide{overflow-x:auto}.plot img{min-width:40rem;width:100%}
+.wide{overflow-x:auto;overflow-wrap:normal}.wide td{white-space:nowrap;padding-right:1.2rem}
+.plot img{min-width:40rem;width:100%}
 .tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(9rem,1fr));gap:.75rem;margin:1rem 0}
 .tiles div{background:var(--card);border:1px solid var(--line);border-radius:.6rem;padding:.6rem .8rem}
 .tiles b{display:block;font-size:1.35rem;line-height:1.3}.tiles span{color:var(--soft);font-size:.85rem}

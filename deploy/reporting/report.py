@@ -11,6 +11,7 @@ from rich.table import Table
 from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.processes.pipeline import Progress, Standing
 from fieldpose.deploy.reporting.output import progress_console, result_console
+from fieldpose.deploy.reporting.reasons import reason_in_words
 
 _MISSING = "-"
 STAGES_TITLE = "latency by stage, waiting included (ms)"
@@ -92,7 +93,7 @@ def rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "frames sent / dropped at the door", f"{sent} / {dropped}"
     yield "frames / with a pose / lost", f"{summary['frames']} / {summary['poses_ok']} / {summary['frames_lost']}"
     if summary["reasons"]:
-        reasons = ", ".join(f"{reason} {count}x" for reason, count in summary["reasons"].items())
+        reasons = ", ".join(f"{reason_in_words(reason)} {count}x" for reason, count in summary["reasons"].items())
         yield "not sure, or without a pose, because", reasons
     if summary["cameras"].keys() - {"calibrated"}:
         yield (

@@ -32,7 +32,7 @@ def run_report(outcome: RunResult, plan: Plan, title: str, recording: Path) -> b
             frames=outcome.frames,
             live=plan.settings.camera.pace == "live",
             interrupted=outcome.interrupted,
-            worst=[(each, shown.get(each.result.frame_id)) for each in bad],
+            worst=[(each, shown.get((each.result.frame_id, each.result.capture_ns))) for each in bad],
             field_lines=[] if plan.field is None else list(field_in_words(plan.field, load_field(plan.field))),
             settings=differing(plan.settings),
             decided=plan.notes,
@@ -41,14 +41,14 @@ def run_report(outcome: RunResult, plan: Plan, title: str, recording: Path) -> b
     )
 
 
-def _pictures(bad: Sequence[Bad], plan: Plan, recording: Path) -> dict[int, np.ndarray]:
-    """By the number of the frame, (h, w, 3) uint8 RGB."""
+def _pictures(bad: Sequence[Bad], plan: Plan, recording: Path) -> dict[tuple[int, int], np.ndarray]:
+    """By number and capture time of the frame, (h, w, 3) uint8 RGB."""
     if plan.field is None:
         return {}
     renderer = load_renderer(plan.field, threads=0, backend=plan.settings.backend)
     results = [each.result for each in bad]
     shown = pictures_of(recording, results, renderer, plan.settings.address)
-    return {picture.result.frame_id: picture.pixels for picture in shown}
+    return {(picture.result.frame_id, picture.result.capture_ns): picture.pixels for picture in shown}
 
 
 def _versions(plan: Plan) -> dict[str, str]:

@@ -14,7 +14,7 @@ from fieldpose.bus.replay import read_recording
 from fieldpose.bus.topics import FRAME, Address
 from fieldpose.deploy.reporting.overlay import VideoFile, captioned, overlaid, without_distortion
 from fieldpose.deploy.reporting.results import FrameResult
-from fieldpose.errors import OutputError
+from fieldpose.stages.geometry import Camera
 from fieldpose.stages.images import shrunk_with_camera
 from fieldpose.stages.nerf.rendering_api import RayRenderer
 from fieldpose.stages.wire import frame_image
@@ -43,7 +43,7 @@ def pictures(
 
     address: of the pipeline that the results are of, where the recording holds several.
 
-    Raises RecordingError, and OutputError for a frame that cannot be decoded.
+    Raises RecordingError.
     """
     finished = [result for result in results if result.outcome == "finished"]
     for done, picture in enumerate(pictures_of(recording, finished, renderer, address), 1):
@@ -54,15 +54,16 @@ def pictures(
 def pictures_of(
     recording: Path, results: Sequence[FrameResult], renderer: RayRenderer, address: Address | None = None
 ) -> Iterator[Picture]:
-    """As `pictures`, of all these frames, whatever became of them."""
-    wanted = {result.frame_id: result for result in results}
+    """As `pictures`, of all these frames, whatever became of them; of those that cannot be decoded there is none."""
+    wanted = {(result.frame_id, result.capture_ns): result for result in results}
     for recorded in read_recording(recording, (FRAME,)):
         if address is not None and not address.covers(recorded.key):
             continue
         frame = cast(Frame, recorded.message)
-        result = wanted.pop(frame.header.frame_id, None)
-        if result is not None:
-            yield _picture(frame, result, renderer)
+        result = wanted.pop(frame.header.frame_key, None)
+        image = None if result is None else frame_image(frame)
+        if result is not None and image is not None:
+            yield _picture(image, frame.camera, result, renderer)
 
 
 def write_video(path: Path, shown: Iterator[Picture]) -> Picture | None:
@@ -97,9 +98,8 @@ def _repeats(picture: Picture, following: Picture) -> int:
     return max(1, round(min(seconds, _LONGEST_STILL_S) * _VIDEO_HZ))
 
 
-def _picture(frame: Frame, result: FrameResult, renderer: RayRenderer) -> Picture:
-    camera = frame.camera
-    image = without_distortion(_decoded(frame), camera)
+def _picture(image: np.ndarray, camera: Camera, result: FrameResult, renderer: RayRenderer) -> Picture:
+    image = without_distortion(image, camera)
     image, small = shrunk_with_camera(image, camera.undistorted(), _WIDEST)
     over = image
     if result.cam_from_object is not None:
@@ -114,10 +114,3 @@ def _caption(result: FrameResult) -> list[str]:
     if result.errors is not None:
         lines.append(f"error {result.errors[0]:.2f} deg, {result.errors[1]:.4f} units")
     return lines
-
-
-def _decoded(frame: Frame) -> np.ndarray:
-    image = frame_image(frame)
-    if image is None:
-        raise OutputError(f"frame {frame.header.frame_id} of the recording cannot be decoded")
-    return image

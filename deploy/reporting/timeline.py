@@ -69,7 +69,7 @@ def timeline(frames: Sequence[FrameResult], kind: str, title: str, live: bool = 
     strip.set_xlim(0, max([at for at, _ in timed], default=0.0) + _LAST_S)
     drawing.align_ylabels()
     _draw_legend(drawing)
-    drawing.suptitle(f"{title}\n{_in_words(frames, live)}", fontsize=10)
+    drawing.suptitle(f"{title}\n{_in_words(frames, live)}", fontsize=10, parse_math=False)
     return file_of(drawing, kind)
 
 

@@ -72,8 +72,10 @@ def _points(picture: np.ndarray, moment: Moment, camera: Camera) -> None:
 def _dots(
     picture: np.ndarray, moment: Moment, camera: Camera, pixels: np.ndarray, colour: tuple[int, int, int]
 ) -> None:  # fmt: skip
-    """pixels (n, 2) are the frame's own; the picture has no distortion and another size."""
+    """pixels (n, 2) are the frame's own; the picture has no distortion and another size, and not all of them."""
     if moment.frame is None or not len(pixels):
         return
-    for x, y in np.rint(camera.project(moment.frame.camera.directions(pixels))).astype(int):
+    placed = camera.project(moment.frame.camera.directions(pixels))
+    inside = (placed > -1).all(axis=1) & (placed < (camera.width, camera.height)).all(axis=1)
+    for x, y in np.rint(placed[inside]).astype(int):
         cv2.circle(picture, (int(x), int(y)), 2, colour, -1, cv2.LINE_AA)

@@ -13,11 +13,11 @@ import pytest
 
 from fieldpose.bus.messages import Reason
 from fieldpose.deploy.cli import main
-from fieldpose.deploy.commands.evaluate import in_short
 from fieldpose.deploy.evaluation.methods import Method
 from fieldpose.deploy.evaluation.pairs import PROTOCOLS, Pair, draw
 from fieldpose.deploy.evaluation.running import Examination
 from fieldpose.deploy.evaluation.scores import Answer, curve, difference, score, share_of_solvable
+from fieldpose.deploy.evaluation.words import in_short
 from fieldpose.deploy.local import PoseFound
 from fieldpose.deploy.scene import demo_file
 from fieldpose.stages.geometry import camera_centre, exp_se3, look_at, rotation_about

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import json
 import os
 import re
 import signal
@@ -11,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -20,6 +22,7 @@ from support.commands import command, fieldpose
 from support.pictures import needs
 
 from fieldpose.deploy.cli import main
+from fieldpose.deploy.evaluation.methods import METHODS
 from fieldpose.deploy.evaluation.page import worst as worst_answers
 from fieldpose.deploy.evaluation.pairs import Pair
 from fieldpose.deploy.evaluation.scores import Answer
@@ -206,6 +209,38 @@ def test_an_evaluation_has_a_page_too(tmp_path: Path, capsys: pytest.CaptureFixt
     ):
         assert words in elements.text
     assert asks_for_nothing(content)
+
+
+def test_an_evaluation_that_is_interrupted_has_its_page_and_scores_too(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+
+    class Nothing:
+        """Finds nothing, and is interrupted at the fourth question."""
+
+        def find(self, *question: object) -> SimpleNamespace:
+            asked.append(question)
+            if len(asked) > 3:
+                raise KeyboardInterrupt
+            return SimpleNamespace(cam_from_object=None, covariance=None, stage_ms={})
+
+    monkeypatch.setattr("fieldpose.deploy.evaluation.running.Examination._warm_up", lambda self, finder: None)
+    for name in ("one-step", "passes"):
+        monkeypatch.setitem(METHODS, name, replace(METHODS[name], make=lambda *parts: Nothing()))
+    field = demo_file("field.safetensors")
+    arguments = ["evaluate", field, field.parent, "--method", "one-step", "--method", "passes", "--seeds", 0]
+    arguments += ["--images", 2, "--poses", 2, "--size", 64, "--report", tmp_path, "--json", tmp_path / "scores.json"]
+    assert main([str(argument) for argument in arguments]) == 130
+    text = Elements((tmp_path / "report.html").read_text()).text
+    assert "interrupted: one-step has answered 2, passes has answered 1" in text
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    assert scores["interrupted"]
+    assert [scores["methods"][name]["pairs"] for name in ("one-step", "passes")] == [2, 1]
+    # Before anything is answered there is nothing to be told.
+    (tmp_path / "scores.json").unlink()
+    assert main([str(argument) for argument in arguments]) == 130
+    assert not (tmp_path / "scores.json").exists()
 
 
 def test_the_worst_answers_come_first() -> None:

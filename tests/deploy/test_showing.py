@@ -18,7 +18,7 @@ from fieldpose.bus.topics import FRAME, Address
 from fieldpose.deploy.reporting.output import PICTURES, check_picture, check_writable, write_bytes, write_json
 from fieldpose.deploy.reporting.overlay import EDGE_RGB, encoded, overlaid
 from fieldpose.deploy.reporting.results import FrameResult, TruthKnown
-from fieldpose.deploy.reporting.showing import Picture, pictures, write_video
+from fieldpose.deploy.reporting.showing import Picture, pictures, pictures_of, write_video
 from fieldpose.deploy.reporting.timeline import plot_timeline, state_spans
 from fieldpose.errors import OutputError
 from fieldpose.stages.geometry import perturb
@@ -63,6 +63,31 @@ def recorded(path: Path, scene: AnalyticScene, count: int) -> list[FrameResult]:
         results.append(result)
     writer.close()
     return results
+
+
+def test_a_picture_is_of_the_very_frame_and_there_is_none_of_what_cannot_be_decoded(
+    tmp_path: Path, scene: AnalyticScene
+) -> None:
+    """A camera that begins again numbers its frames as it did before."""
+    writer = RecordingWriter(tmp_path / "a.mcap")
+    shades = ((0, 1, 40), (1, 2, None), (0, 3, 200))
+    for number, at_ns, shade in shades:
+        frame = frame_message(np.full((CAMERA.height, CAMERA.width, 3), shade or 0, np.uint8), CAMERA, number)
+        if shade is None:
+            frame.image, frame.encoding = np.frombuffer(b"no picture", np.uint8), "jpeg"
+        frame.header = Header("camera", number, number, 0, at_ns, at_ns)
+        writer.write(Address().key(FRAME), FRAME, frame, at_ns)
+    writer.close()
+    results = [FrameResult(number, at_ns, "finished", state="lost") for number, at_ns, _ in shades]
+    shown = list(pictures_of(tmp_path / "a.mcap", results[1:], scene))
+    assert [picture.result.capture_ns for picture in shown] == [3]
+    assert np.median(shown[0].pixels) == pytest.approx(200, abs=3)
+
+
+def test_a_title_is_no_formula(tmp_path: Path, scene: AnalyticScene) -> None:
+    unjudged = [replace(result, truth=None) for result in recorded(tmp_path / "a.mcap", scene, 3)]
+    plot_timeline(unjudged, tmp_path / "a.png", "video:/a/$_{$.mp4")
+    assert (tmp_path / "a.png").stat().st_size > 10_000
 
 
 def test_a_video_shows_each_finished_frame_until_the_next(tmp_path: Path, scene: AnalyticScene) -> None:

@@ -32,7 +32,7 @@ from fieldpose.deploy.viewing.recorded import RecordedMoments
 from fieldpose.deploy.viewing.scene import ellipsoid, up_direction
 from fieldpose.errors import UsageError
 from fieldpose.stages.geometry import camera_centre, exp_se3
-from fieldpose.stages.nerf.field import load_metadata
+from fieldpose.stages.nerf.field import load_field, load_metadata
 from fieldpose.stages.nerf.loading import load_renderer
 
 ENOUGH_S = 20.0
@@ -288,9 +288,45 @@ def test_a_phone_shows_a_run_live_and_asks_something_of_it(tmp_path: Path) -> No
             run.wait()
 
 
+def test_a_field_in_another_frame_than_the_recorded_poses_is_refused(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    field = load_field(demo_file("field.safetensors"))
+    field.metadata = msgspec.structs.replace(
+        field.metadata, frame=msgspec.structs.replace(field.metadata.frame, translation=(1.0, 0.0, 0.0))
+    )
+    field.save(tmp_path / "moved.safetensors")
+    assert main(["view", str(recording), "--field", str(tmp_path / "moved.safetensors")]) == 2
+    assert "its frame is another than that of the recorded poses" in one_line(capsys)
+
+
+def test_points_that_are_nowhere_in_the_picture_are_left_out() -> None:
+    pixels = np.array([[2, 1], [1e9, 1], [-1e9, 3], [3, 2]], np.float32)
+    moments = Moments()
+    moments.note(bus_samples.frame(0))
+    message = followed(0, [True] * 4)
+    message.pixels_in_frame = pixels
+    moments.note(message)
+    moments.note(state(0))
+    newest = moments.newest()
+    assert newest is not None
+    assert drawn(newest, None, "none", points=True) is not None
+
+
+def one_line(capsys: pytest.CaptureFixture[str]) -> str:
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
 def test_what_cannot_be_shown_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["view", str(tmp_path / "no.mcap")]) == 2
     assert "cannot be read" in capsys.readouterr().err
+    assert main(["view", str(tmp_path / "run.mcap.partial")]) == 2
+    assert f"`fieldpose recover {tmp_path}/run.mcap.partial --out {tmp_path}/run.mcap` mends it" in one_line(capsys)
+    assert main(["view", str(demo_file("sequence.mcap"))]) == 2
+    assert "holds no field" in one_line(capsys)
+    assert main(["view", str(demo_file("sequence.mcap")), "--field", str(demo_file("field.safetensors"))]) == 2
+    assert "holds no states of tracking, so nothing to look at" in one_line(capsys)
     assert main(["view", str(demo_file("field.safetensors")), "--port", "0"]) == 2
     assert "expected 1 to 65535" in capsys.readouterr().err
 

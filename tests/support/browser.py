@@ -48,8 +48,12 @@ class Browser:
         """Touch the middle of what a script gives, scrolled to where it is seen."""
         box = f"(() => {{ const e = {element}; e.scrollIntoView({{block: 'center'}}); const r ="
         x, y = self.wait_for(f"{box} e.getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2]; }})()")
-        self._call("Input.dispatchTouchEvent", type="touchStart", touchPoints=[{"x": x, "y": y}])
-        self._call("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+        # Both at once: on a busy host a touch whose end is sent a little later is a long one.
+        touch = "Input.dispatchTouchEvent"
+        began = self._send(touch, type="touchStart", touchPoints=[{"x": x, "y": y}])
+        ended = self._send(touch, type="touchEnd", touchPoints=[])
+        self._answer(began)
+        self._answer(ended)
 
     def ask(self, script: str) -> Any:
         """The value of a script in the page."""
@@ -66,11 +70,17 @@ class Browser:
         path.write_bytes(base64.b64decode(self._call("Page.captureScreenshot")["data"]))
 
     def _call(self, method: str, **parameters: Any) -> Any:
+        return self._answer(self._send(method, **parameters))
+
+    def _send(self, method: str, **parameters: Any) -> int:
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
+        return self._number
+
+    def _answer(self, number: int) -> Any:
         while True:
             said = json.loads(self._socket.recv(timeout=60))
-            if said.get("id") == self._number:
+            if said.get("id") == number:
                 return said["result"]
 
     def __enter__(self) -> Browser:

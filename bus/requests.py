@@ -103,7 +103,7 @@ class SetSolving(Request[ControlValues], kw_only=True, tag="set_solving"):
 
 
 class TakeKeyframe(Request[ControlValues], kw_only=True, tag="take_keyframe"):
-    """Solve the next frame that is followed well, from where it was followed; keep its view if that is borne out."""
+    """Solve the newest frame, or the next that is followed well, from where it was; keep its view if that is right."""
 
 
 class Show(Request[ControlValues], kw_only=True, tag="show"):

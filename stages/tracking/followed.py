@@ -118,7 +118,7 @@ class FollowedPolicy(VideoPolicy):
         return self._guess(GuessReason.MOTION, ahead)
 
     def take_keyframe(self) -> None:
-        """Solve the next frame that is followed well, from where it was followed, and keep its view.
+        """Solve the newest frame, or the next that is followed well, from where it was followed, and keep its view.
 
         Only where the solve bears out what was followed; a restart forgets it, but not what is kept. Raises
         RefusedError where nothing is tracked.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +16,7 @@ from fieldpose.bus.recorder import NAME, Recorder
 from fieldpose.bus.requests import SaveSnapshot
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address
-from fieldpose.bus.transport import LOCAL_HUB
+from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
 from fieldpose.deploy.access.joining import Entry, joined
 from fieldpose.deploy.access.roles import OPERATOR
 from fieldpose.deploy.graph import RECORDER
@@ -23,6 +24,7 @@ from fieldpose.deploy.recording_options import RecordingOptions, seconds_of
 from fieldpose.deploy.reporting.output import check_writable, progress_console
 from fieldpose.errors import RefusedError, UsageError
 
+_BESIDE = "beside"
 _HUB_S = 5.0
 _SAVED_S = 60.0
 """A snapshot may have hundreds of megabytes."""
@@ -71,10 +73,17 @@ class Options:
             recorder = Recorder(
                 bus, self.address, self.options.store(self.recording, self.address), self.options.keep()
             )
-            self._wait(recorder)
+            with self._announced(bus):
+                self._wait(recorder)
             lossless = recorder.close()
         self._tell(recorder, lossless)
         return 0
+
+    def _announced(self, bus: ZenohBus) -> AbstractContextManager[object]:
+        """Tell pages that there is one to ask for snapshots, under a name that is no pipeline's own recorder."""
+        if self.options.snapshots is None:
+            return nullcontext()
+        return closing(bus.hold(Address(self.address.site, _BESIDE, _BESIDE).live(RECORDER)))
 
     def _tell(self, recorder: Recorder, lossless: bool) -> None:
         if self.recording is not None:

@@ -65,7 +65,11 @@ def _in_order(row: Process, plans: Sequence[Plan]) -> tuple[Plan, ...]:
 
 
 def programs(
-    plans: Sequence[Plan], folder: Path, hub: str, record: Path | None, recording: RecordingOptions = _PLAIN,
+    plans: Sequence[Plan],
+    folder: Path,
+    hub: str,
+    record: Path | None,
+    recording: RecordingOptions = _PLAIN,
     keys: Path | None = None,
 ) -> list[Program]:
     """The command line and environment of each process; what they read is left in `folder`.

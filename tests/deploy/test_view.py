@@ -22,8 +22,8 @@ from support.commands import command, fieldpose
 import fieldpose as fieldpose_api
 from fieldpose.bus.messages import CameraInfo, Followed, Frame, Reason, State, TrackingState
 from fieldpose.bus.ports import first_header
-from fieldpose.bus.replay import read_recording
-from fieldpose.bus.topics import FRAME
+from fieldpose.bus.replay import info, read_recording
+from fieldpose.bus.topics import FRAME, STATE
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.viewing.drawing import FOUND_RGB, LOST_RGB, OVERLAYS, drawn
@@ -249,7 +249,8 @@ def sent_again_and_again(hub: str, stop: threading.Event) -> None:
 @needs_browser
 def test_a_phone_shows_a_run_live_and_asks_something_of_it(tmp_path: Path) -> None:
     run = subprocess.Popen(
-        command("run", demo_file("field.safetensors"), "--source", "bus", "--view"), cwd=tmp_path,
+        command("run", demo_file("field.safetensors"), "--source", "bus", "--view", "--record.snapshots", "kept"),
+        cwd=tmp_path,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
     )  # fmt: skip
     stop, sending = threading.Event(), None
@@ -258,7 +259,7 @@ def test_a_phone_shows_a_run_live_and_asks_something_of_it(tmp_path: Path) -> No
         printed = ""
         while not ("http" in printed and "running" in printed):
             printed += run.stdout.readline()
-        hub, url = (re.search(pattern, printed) for pattern in (r"hub (tcp\S+)", r"http://127[\d.]+:\d+"))
+        hub, url = (re.search(pattern, printed) for pattern in (r"hub (t\S+)", r"http://127[\d.]+:\d+"))
         assert hub is not None
         assert url is not None
         with Browser(url.group(), tmp_path / "profile", phone=True) as browser:
@@ -266,8 +267,10 @@ def test_a_phone_shows_a_run_live_and_asks_something_of_it(tmp_path: Path) -> No
             sending = threading.Thread(target=sent_again_and_again, args=(hub.group(1), stop))
             sending.start()
             browser.wait_for(f"/tracking; \\d+ of \\d+ points found/.test({SAID})", 60)
-            assert browser.ask(f"{BUTTON.format('save the last 10 s')}.disabled")
-            assert "Saving needs a recorder" in browser.ask(SAID)
+            browser.tap(BUTTON.format("save the last 10 s"))
+            browser.wait_for(f"{SAID}.includes('Saved ')")
+            (saved,) = (tmp_path / "kept").glob("*.mcap")
+            assert {FRAME.name, STATE.name} <= {topic.topic for topic in info(saved).topics}
             browser.tap(BUTTON.format("take a keyframe"))
             browser.wait_for(f"{SAID}.includes('view is kept')")
             browser.tap(BUTTON.format("begin again"))

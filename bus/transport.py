@@ -74,12 +74,17 @@ class ZenohBus:
     def wait_for_hub(self, timeout_s: float) -> None:
         """Return once the hub answers. Raises TransportError after `timeout_s`."""
         deadline = time.monotonic() + timeout_s
-        while not self._session.info.routers_zid():
+        while not self.has_hub:
             if time.monotonic() > deadline:
                 raise TransportError(
                     f"no hub answers at {self._hub} after {timeout_s:g} s; start it, or name its address"
                 )
             time.sleep(0.005)
+
+    @property
+    def has_hub(self) -> bool:
+        """Whether there is a link to the hub now, on which it has been heard of within Zenoh's lease of 2 s."""
+        return bool(self._session.info.routers_zid())
 
     def put(self, key: str, payload: bytes, topic: Topic[Any] | None = None) -> None:
         try:

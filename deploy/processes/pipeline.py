@@ -15,6 +15,7 @@ from typing import Literal
 from fieldpose.bus.messages import State
 from fieldpose.bus.parts_info import joined
 from fieldpose.bus.replay import RecordingInfo, info
+from fieldpose.bus.segments import remove_orphans
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address, shared_address
 from fieldpose.bus.transport import ZenohBus
@@ -23,7 +24,8 @@ from fieldpose.deploy.graph import CAMERA, HUB, OBSERVER, RECORDER, STAGES
 from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.processes.collector import Collector
 from fieldpose.deploy.processes.endpoints import check_free, free_port
-from fieldpose.deploy.processes.programs import members, preloading, programs
+from fieldpose.deploy.processes.liveness import Life, Liveness
+from fieldpose.deploy.processes.programs import Member, members, preloading, programs
 from fieldpose.deploy.processes.supervision import Supervisor
 from fieldpose.deploy.recording_options import RecordingOptions, recorded_files, unfinished_files
 from fieldpose.deploy.reporting.results import RunResult
@@ -73,13 +75,15 @@ class Standing:
 class Progress:
     """What a run is doing, for people to look at.
 
-    standings: of each pipeline; pids: its processes by name; hub: where others can join it.
+    standings: of each pipeline; pids: its processes by name; hub: where others can join it; hung: those that were
+    found to be hung and were replaced, once for each time.
     """
 
     phase: Literal["starting", "running", "finishing"]
     waiting_for: tuple[str, ...] = ()
     standings: tuple[Standing, ...] = ()
     restarts: int = 0
+    hung: tuple[str, ...] = ()
     pids: Mapping[str, int] = field(default_factory=dict)
     hub: str = ""
 
@@ -111,8 +115,11 @@ def run_pipelines(run: Run, report: Report = lambda progress: None) -> list[RunR
     ):
         at = Joint(hub, None if keys is None else access_as(keys, OBSERVER))
         made = programs(run.plans, folder, hub, run.record, run.recording, keys)
-        with Supervisor(folder, made, preloading(folder)) as supervisor:
-            return _Running(run, supervisor, at, signals, report).run()
+        try:
+            with Supervisor(folder, made, preloading(folder)) as supervisor:
+                return _Running(run, supervisor, at, signals, report).run()
+        finally:
+            remove_orphans()
 
 
 class _Running:
@@ -122,6 +129,8 @@ class _Running:
         self._cameras = [member.name for member in self._members if member.row.name == CAMERA]
         self._collectors: list[Collector] = []
         self._supervisor = supervisor
+        self._liveness = Liveness()
+        self._hub_looks = 0
         self._at = at
         self._stop = signals.stop
         self._report = report
@@ -131,7 +140,7 @@ class _Running:
 
     def run(self) -> list[RunResult]:
         began = time.monotonic()
-        bus = self._at.session()
+        self._bus = bus = self._at.session()
         try:
             self._collectors = [
                 Collector(bus, plan.settings.address, plan.object_from_dataset()) for plan in self._plans
@@ -165,6 +174,12 @@ class _Running:
             restarts={member.row.name: restarts[member.name] for member in its if member.name in restarts},
             plan=plan.notes,
             recording=None if recording is None else recording.of(plan.settings.address),
+            faults=[
+                replace(fault, process=member.row.name)
+                for fault in self._liveness.faults
+                for member in its
+                if member.name == fault.process
+            ],
             interrupted=not finished,
             start_s=start_s,
         )
@@ -207,8 +222,25 @@ class _Running:
             collector.update()
         processes = self._supervisor.check(self._limit, self._spared)
         self._pids = {name: process.pid for name, process in processes.items() if process.pid}
+        for name in self._liveness.look([self._life(member) for member in self._members]):
+            self._supervisor.kill(name)
         ended = [name in processes and processes[name].finished for name in self._cameras]
         return bool(ended) and all(ended)
+
+    def _life(self, member: Member) -> Life:
+        """How a process is, by what has come of it."""
+        pid = self._pids.get(member.name, 0)
+        if member.row.name == HUB:
+            linked = self._bus.has_hub
+            self._hub_looks += linked
+            return Life(member.name, pid, self._hub_looks, linked, loops=False)
+        said = [
+            stats
+            for plan, collector in zip(self._plans, self._collectors, strict=True)
+            if plan in member.plans and (stats := collector.stats.get(member.row.name)) is not None
+        ]
+        beats = tuple(stats.header.sent_ns for stats in said)
+        return Life(member.name, pid, beats or None, any(stats.ready for stats in said))
 
     def _finish(self, finished: bool) -> None:
         """End the stages, then the recorder, so that it has all that they said, then the hub."""
@@ -228,7 +260,9 @@ class _Running:
             for plan, collector in zip(self._plans, self._collectors, strict=True)
         )
         restarts = sum(self._supervisor.restarts.values())
-        return Progress(phase, standings=tuple(standings), restarts=restarts, pids=self._pids)
+        return Progress(
+            phase, standings=tuple(standings), restarts=restarts, hung=tuple(self._liveness.hung), pids=self._pids
+        )
 
 
 def recorded_by(run: Run, supervisor: Supervisor) -> tuple[RecordingInfo | None, str | None]:

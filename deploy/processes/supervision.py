@@ -3,48 +3,38 @@
 from __future__ import annotations
 
 import os
-import shlex
 import signal
 import subprocess
 import sys
 import time
 import xmlrpc.client
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from supervisor.xmlrpc import SupervisorTransport
-
 from fieldpose.deploy.graph import thread_environment
+from fieldpose.deploy.processes.configuration import USER_ERROR, Program, configuration
 from fieldpose.deploy.processes.lifeline import PARENT
+from fieldpose.deploy.processes.rpc import Transport
+from fieldpose.deploy.processes.sessions import end_session
 from fieldpose.errors import ProcessError
 
-USER_ERROR = 2
-"""The exit code of a process that was given something that only the user can mend."""
+__all__ = ["USER_ERROR", "ProcessInfo", "Program", "Supervisor"]
+
 _LONGEST_SOCKET_PATH = 100
 _ANSWER_S = 10.0
+_CALL_S = 1.0
+"""A call that takes longer is made again, so that whoever waits for it can look after other things."""
+_FINISH_S = 5.0
+"""How long processes may take that end because supervisord has: a recorder finishes its file."""
 _END_S = 2.0
 _POLL_S = 0.02
 _SUPERVISORD = (sys.executable, "-P", "-m", "fieldpose.deploy.processes.supervisord")
 _RESTING = ("STOPPED", "EXITED", "FATAL")
-
-
-@dataclass(frozen=True)
-class Program:
-    """A process to keep up: its command line, what is added to its environment, how long it may take to stop.
-
-    `ends`: exit code 0 means that it has done its work; without it, it is brought back after that too.
-    """
-
-    name: str
-    command: Sequence[str]
-    environment: Mapping[str, str] = field(default_factory=dict)
-    stop_s: float = 2.0
-    ends: bool = False
 
 
 @dataclass(frozen=True)
@@ -83,8 +73,10 @@ class Supervisor:
         self._programs, self._prepare, self._answered = programs, prepare, False
         self._socket = folder / "supervisor.sock"
         self._pids: dict[str, int] = {}
+        self._infos: dict[str, ProcessInfo] = {}
+        self._heard_s = time.monotonic()
         self._daemon: subprocess.Popen[bytes] | None = None
-        self._transport: Any = SupervisorTransport(None, None, f"unix://{self._socket}")
+        self._transport: Any = Transport(self._socket, _CALL_S)
         self._rpc: Any = xmlrpc.client.ServerProxy("http://127.0.0.1", self._transport).supervisor
 
     def __enter__(self) -> Supervisor:
@@ -115,12 +107,17 @@ class Supervisor:
         self._end_daemon(nothing_left=ended)
 
     def poll(self) -> dict[str, ProcessInfo]:
-        """The state of each process now, of none while they are prepared; also counts who came back since."""
+        """The state of each process now, of none while they are prepared; also counts who came back since.
+
+        What was said last where supervisord is slow to answer; raises ProcessError where it is gone, or hung.
+        """
         if not self._answers():
             return {}
-        infos = {
-            entry["name"]: ProcessInfo(entry["statename"], entry["pid"], entry["exitstatus"])
-            for entry in self._call(self._rpc.getAllProcessInfo) or ()
+        entries = self._call(self._rpc.getAllProcessInfo)
+        if entries is None:
+            return self._infos
+        infos = self._infos = {
+            entry["name"]: ProcessInfo(entry["statename"], entry["pid"], entry["exitstatus"]) for entry in entries
         }
         for name, info in infos.items():
             before = self._pids.get(name, 0)
@@ -143,6 +140,10 @@ class Supervisor:
             if name not in spared and (info.given_up or self.restarts.get(name, 0) > restart_limit):
                 raise ProcessError(self._why(name, info))
         return infos
+
+    def kill(self, name: str) -> None:
+        """End a process at once; it comes back, as after any other end that nobody asked for."""
+        self._call(self._rpc.signalProcess, name, "KILL")
 
     def stop(self, names: Sequence[str], timeout_s: float) -> bool:
         """End processes, all at the same time; those that are still up after the timeout are killed.
@@ -186,14 +187,39 @@ class Supervisor:
         return f"{name} does not stay up: {self.last_line(name)}; its log is {self.log(name)}"
 
     def _call(self, method: Callable[..., Any], *arguments: Any) -> Any:
-        """What supervisord answers; None where it refuses, as for a process that has just ended by itself."""
+        """What supervisord answers; None where it refuses, as for a process that has just ended, or is slow."""
         try:
-            return method(*arguments)
+            answer = method(*arguments)
         except xmlrpc.client.Fault:
+            answer = None
+        except TimeoutError:
+            self._transport.close()
+            silent_s = time.monotonic() - self._heard_s
+            if silent_s > _ANSWER_S:
+                raise ProcessError(
+                    f"supervisord, which looks after the processes, is hung: no answer for {silent_s:.0f} s; the run is"
+                    " over"
+                ) from None
             return None
         except (OSError, HTTPException, xmlrpc.client.ProtocolError) as error:
             self._transport.close()  # it would go on with a broken connection
-            raise ProcessError(f"the supervisor of the processes does not answer: {error}") from error
+            raise ProcessError(self._gone(error)) from error
+        self._heard_s = time.monotonic()
+        return answer
+
+    def _gone(self, error: Exception) -> str:
+        code = self._ended() if self._answered else None
+        if code is None:
+            return f"the supervisor of the processes does not answer: {error}"
+        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with code {code}"
+        return f"supervisord, which looks after the processes, {how}; the run is over"
+
+    def _ended(self) -> int | None:
+        """The exit code of supervisord; its sockets are gone a moment before it is."""
+        assert self._daemon is not None
+        with suppress(subprocess.TimeoutExpired):
+            self._daemon.wait(_CALL_S)
+        return self._daemon.returncode
 
     def _wait_for_answer(self) -> None:
         deadline = time.monotonic() + _ANSWER_S
@@ -212,8 +238,7 @@ class Supervisor:
             if self._daemon is None or self._daemon.poll() is not None:
                 raise ProcessError(f"supervisord cannot start: {self._last_words()}")
             with suppress(ProcessError):
-                self._call(self._rpc.getState)
-                self._answered = True
+                self._answered = self._call(self._rpc.getState) is not None
         return self._answered
 
     def _last_words(self) -> str:
@@ -230,50 +255,5 @@ class Supervisor:
         except subprocess.TimeoutExpired:
             self._daemon.kill()
             self._daemon.wait()
-
-
-def configuration(programs: Sequence[Program]) -> str:
-    """The file that supervisord reads; its own files are relative to the folder that it runs in."""
-    values: dict[str, dict[str, object]] = {
-        "unix_http_server": {"file": "supervisor.sock", "chmod": "0700"},
-        "supervisord": {
-            "nodaemon": "true",
-            "silent": "true",
-            "logfile": "supervisord.log",
-            "pidfile": "supervisord.pid",
-            "childlogdir": ".",
-        },
-        "rpcinterface:supervisor": {
-            "supervisor.rpcinterface_factory": "supervisor.rpcinterface:make_main_rpcinterface"
-        },
-    }
-    for program in programs:
-        values[f"program:{program.name}"] = _program(program)
-    return "\n".join(_section(name, content) for name, content in values.items())
-
-
-def _program(program: Program) -> dict[str, object]:
-    environment = ",".join(f'{name}="{value}"' for name, value in program.environment.items())
-    return {
-        "command": shlex.join(program.command),
-        "environment": environment,
-        "directory": Path.cwd(),
-        "autorestart": "unexpected",
-        "exitcodes": f"0,{USER_ERROR}" if program.ends else USER_ERROR,
-        # Up as soon as it is started: a bad start is told by the exit code, and `check` counts the others.
-        "startsecs": 0,
-        "startretries": 3,
-        "stopwaitsecs": max(1, round(program.stop_s)),
-        "stopasgroup": "true",
-        "killasgroup": "true",
-        "redirect_stderr": "true",
-        "stdout_logfile": f"{program.name}.log",
-        "stdout_logfile_maxbytes": "10MB",
-        "stdout_logfile_backups": 1,
-    }
-
-
-def _section(name: str, content: Mapping[str, object]) -> str:
-    # A percent sign begins an expansion in these files, a semicolon after a space a comment.
-    lines = [f"{key}={str(value).replace('%', '%%')}" for key, value in content.items() if value != ""]
-    return "\n".join([f"[{name}]", *lines, ""])
+        if not nothing_left:
+            end_session(self._daemon.pid, _FINISH_S)

@@ -21,22 +21,25 @@ CAMERA_ORIGINS = {
     "assumed": "with an ASSUMED field of view, so that no pose is sure; give --camera.camera-file",
 }  # fmt: skip
 """Where a frame's intrinsics come from, in words."""
+_FAULTS = {"hung": "hung and was replaced", "ended": "ended unasked"}
 
 
 @contextmanager
 def live_line(title: str) -> Iterator[Callable[[Progress], None]]:
     """Gives a function that shows a run's progress on stderr, and once, above it, where other programs find the hub."""
     console = progress_console()
-    phase = ""
+    phase, told = "", 0
     with console.status(title) as status:
 
         def report(progress: Progress) -> None:
-            nonlocal phase
+            nonlocal phase, told
             if progress.phase == "starting" != phase:
                 console.print(f"{title}: hub {progress.hub}", highlight=False, soft_wrap=True)
             if progress.phase != phase and not console.is_terminal:
                 console.print(f"{title}: {progress.phase}", highlight=False)
-            phase = progress.phase
+            for name in progress.hung[told:]:
+                console.print(f"{title}: {name} hung, was killed and is started again", highlight=False, soft_wrap=True)
+            phase, told = progress.phase, len(progress.hung)
             status.update(f"{title}: {_in_words(progress)}")
 
         yield report
@@ -48,6 +51,8 @@ def _in_words(progress: Progress) -> str:
     if progress.phase == "finishing":
         return "finishing"
     words = [_standing(standing, named=len(progress.standings) > 1) for standing in progress.standings]
+    if progress.hung:
+        words.append(f"{len(progress.hung)} hung and replaced")
     if progress.restarts:
         words.append(f"{progress.restarts} restarts")
     return (" | " if len(progress.standings) > 1 else ", ").join(words)
@@ -122,6 +127,13 @@ def rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     yield "messages recorded / lost", f"{messages['recorded']} / {messages['lost']}"
     restarts = ", ".join(f"{name} {count}x" for name, count in summary["restarts"].items())
     yield "processes restarted", restarts or "none"
+    for fault in summary["faults"]:
+        yield f"{fault['process']} {_FAULTS[fault['what']]}", _fault(fault)
+
+
+def _fault(fault: Mapping[str, Any]) -> str:
+    away = "not back" if fault["away_s"] is None else f"back after {fault['away_s']:.1f} s"
+    return f"{away}, {fault['frames_without_pose']} frames without a pose"
 
 
 def _stages(summary: Mapping[str, Any]) -> Table:

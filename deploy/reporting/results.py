@@ -22,6 +22,10 @@ The keys of a summary, which programs may rely on:
   messages           {recorded, lost}: lost are those that the recorder should have got and has not written (without
                      a recorder: those that a stage should have got)
   restarts           name of a process -> how often it came back
+  faults             of each process that ended unasked or was hung, in the order found: process, what (ended or
+                     hung), at_s (its last sign of life, from the first frame's sending), away_s (from there until its
+                     successor was ready; null where the run ended before) and frames_without_pose (frames taken in
+                     that time that have no measured pose)
   start_s            seconds until all processes were ready
   processes          name -> busy_ms_p50, busy_ms_p90, busy_s, cpu_s, rss_mb, failed, refused, gaps, skipped
 """
@@ -41,6 +45,7 @@ from fieldpose.bus.messages import Stats
 from fieldpose.bus.replay import RecordingInfo
 from fieldpose.bus.topics import Address
 from fieldpose.deploy.graph import AT_WORK
+from fieldpose.deploy.processes.liveness import Fault
 from fieldpose.stages.geometry import Camera, rotation_error_deg, translation_error
 from fieldpose.stages.tracking.scoring import deviations
 
@@ -128,6 +133,7 @@ class RunResult:
     stats: Mapping[str, Stats] = field(default_factory=dict)
     observed: Mapping[str, int] = field(default_factory=dict)
     restarts: Mapping[str, int] = field(default_factory=dict)
+    faults: Sequence[Fault] = ()
     recording: RecordingInfo | None = None
     plan: Mapping[str, str] = field(default_factory=dict)
     recording_error: str | None = None
@@ -156,6 +162,7 @@ def summarise(run: RunResult) -> dict[str, Any]:
         "plan": dict(run.plan),
         "messages": _messages(run),
         "restarts": dict(run.restarts),
+        "faults": [_fault(fault, run.frames) for fault in run.faults],
         "start_s": run.start_s,
         "processes": {name: {key: getattr(s, key) for key in _STATS} for name, s in sorted(run.stats.items())},
     }
@@ -222,6 +229,19 @@ def _messages(run: RunResult) -> dict[str, int]:
         max(missing[key], run.observed.get(key, 0) - recorded[key]) for key in missing.keys() | run.observed.keys()
     )
     return {"recorded": run.recording.messages, "lost": lost}
+
+
+def _fault(fault: Fault, frames: Sequence[FrameResult]) -> dict[str, Any]:
+    sent = [frame.sent_ns for frame in frames if frame.sent_ns is not None]
+    until_ns = fault.back_ns or max(sent, default=fault.silent_ns)
+    missed = [frame for frame in frames if fault.silent_ns <= frame.capture_ns <= until_ns]
+    return {
+        "process": fault.process,
+        "what": fault.what,
+        "at_s": (fault.silent_ns - min(sent)) / 1e9 if sent else None,
+        "away_s": fault.away_s,
+        "frames_without_pose": sum(frame.cam_from_object is None for frame in missed),
+    }
 
 
 def _by_stage(results: Sequence[FrameResult]) -> dict[str, dict[str, float | None]]:

@@ -3,25 +3,35 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _FOLDER = Path("/dev/shm")
 _SUFFIX = ".zenoh"
 
 
-def remove_orphans() -> list[Path]:
-    """Remove segments of this user that no process has open; returns them. Does nothing where there is no /dev/shm.
+@contextmanager
+def removed_orphans() -> Iterator[None]:
+    """In the end remove this user's segments that no process has open, and those that this one has come to have open.
 
-    Zenoh holds a segment open as long as it uses it, and goes by the same.
+    For a run of other processes that are gone then: who got messages by a segment holds it open as long as it lives.
+    Zenoh goes by open files as well. Does nothing where there is no /dev/shm.
     """
-    left = {path for path in _segments() if _is_mine(path)}
-    for held in _open_files() if left else ():
-        left.discard(held)
-    for path in left:
-        with suppress(OSError):
-            path.unlink()
-    return sorted(left)
+    before = segments_of([os.getpid()])
+    try:
+        yield
+    finally:
+        left = {path for path in _segments() if _is_mine(path)} - before
+        left -= segments_of(_pids_but(os.getpid())) if left else set()
+        for path in left:
+            with suppress(OSError):
+                path.unlink()
+
+
+def segments_of(pids: Iterable[int]) -> set[Path]:
+    """The segments that processes have open; of one that is gone, none."""
+    return {path for pid in pids for path in _opened_by(pid) if path.parent == _FOLDER and path.suffix == _SUFFIX}
 
 
 def _segments() -> list[Path]:
@@ -38,12 +48,15 @@ def _is_mine(path: Path) -> bool:
         return False
 
 
-def _open_files() -> list[Path]:
-    """Of all processes that may be looked at: all of this user's."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*/fd"):
-        with suppress(OSError):
-            for link in folder.iterdir():
-                with suppress(OSError):
-                    found.append(Path(os.readlink(link)))
+def _pids_but(one: int) -> Iterator[int]:
+    """Of all processes, of which this user's may be looked at."""
+    return (pid for folder in Path("/proc").glob("[0-9]*") if (pid := int(folder.name)) != one)
+
+
+def _opened_by(pid: int) -> set[Path]:
+    found = set()
+    with suppress(OSError):
+        for link in Path(f"/proc/{pid}/fd").iterdir():
+            with suppress(OSError):
+                found.add(Path(os.readlink(link)))
     return found

@@ -26,7 +26,10 @@ class Program:
 
 
 def configuration(programs: Sequence[Program]) -> str:
-    """The file that supervisord reads; its own files are relative to the folder that it runs in."""
+    """The file that supervisord reads, which starts the programs in this order.
+
+    Its own files are relative to the folder that it runs in.
+    """
     values: dict[str, dict[str, object]] = {
         "unix_http_server": {"file": "supervisor.sock", "chmod": "0700"},
         "supervisord": {
@@ -40,8 +43,8 @@ def configuration(programs: Sequence[Program]) -> str:
             "supervisor.rpcinterface_factory": "supervisor.rpcinterface:make_main_rpcinterface"
         },
     }
-    for program in programs:
-        values[f"program:{program.name}"] = _program(program)
+    for place, program in enumerate(programs):
+        values[f"program:{program.name}"] = {**_program(program), "priority": place}
     return "\n".join(_section(name, content) for name, content in values.items())
 
 

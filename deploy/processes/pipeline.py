@@ -15,7 +15,7 @@ from typing import Literal
 from fieldpose.bus.messages import State
 from fieldpose.bus.parts_info import joined
 from fieldpose.bus.replay import RecordingInfo, info
-from fieldpose.bus.segments import remove_orphans
+from fieldpose.bus.segments import removed_orphans
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address, shared_address
 from fieldpose.bus.transport import ZenohBus
@@ -45,7 +45,7 @@ class Run:
     """Plans on this machine, of one pipeline each, with one hub and one recorder.
 
     listen: the hub's address (default: a free port); logs: a folder to keep; recording: how it is recorded; entry: who
-    is let in.
+    is let in; order: names of processes to be started first, in this order, before the others in that of the graph.
     """
 
     plans: tuple[Plan, ...]
@@ -54,6 +54,7 @@ class Run:
     logs: Path | None = None
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     entry: Entry = field(default_factory=Entry)
+    order: tuple[str, ...] = ()
 
     @property
     def recorded(self) -> bool:
@@ -115,11 +116,9 @@ def run_pipelines(run: Run, report: Report = lambda progress: None) -> list[RunR
     ):
         at = Joint(hub, None if keys is None else access_as(keys, OBSERVER))
         made = programs(run.plans, folder, hub, run.record, run.recording, keys)
-        try:
-            with Supervisor(folder, made, preloading(folder)) as supervisor:
-                return _Running(run, supervisor, at, signals, report).run()
-        finally:
-            remove_orphans()
+        made.sort(key=lambda program: run.order.index(program.name) if program.name in run.order else len(run.order))
+        with removed_orphans(), Supervisor(folder, made, preloading(folder)) as supervisor:
+            return _Running(run, supervisor, at, signals, report).run()
 
 
 class _Running:

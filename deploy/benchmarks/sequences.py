@@ -58,9 +58,14 @@ def found(names: tuple[str, ...], fields: Fields, report: Callable[[str], None])
     return sequences
 
 
+def demo() -> Sequence:
+    """The sequence of the demo scene. Raises FieldposeError where fieldpose was installed without it."""
+    return Sequence(DEMO, demo_file("sequence.mcap"), demo_file("field.safetensors"), _DEMO_LIMIT)
+
+
 def _sequence(name: str, fields: Fields, report: Callable[[str], None]) -> Sequence:
     if name == DEMO:
-        return Sequence(DEMO, demo_file("sequence.mcap"), demo_file("field.safetensors"), _DEMO_LIMIT)
+        return demo()
     if name == KITCHEN:
         field = fields.kitchen or _learnt(fields, report)
         return Sequence(KITCHEN, fields.kitchen_data / "sequence.mcap", field)

@@ -278,3 +278,27 @@ def print_mesh(figures: dict[str, Any]) -> None:
                 rest = (f"{score['complete']:.1%}", str(row["triangles"]), f"{row['seconds']:.0f}")
                 table.add_row(way, part, *errors, *rest)
     result_console().print(table)
+
+
+def print_chaos(figures: dict[str, Any]) -> None:
+    """A row for each kind of fault, what was not as it must be, and what was left out."""
+    console = result_console()
+    title = f"{figures['happened']} faults, seed {figures['seed']}, {figures['frames']} frames"
+    table = Table(title=title, title_justify="left")
+    for name in ("fault", "events", "failed", "cause gone after, s: p50, highest", "tracks again after, s"):
+        table.add_column(name, justify="left" if name == "fault" else "right")
+    for kind, row in figures["kinds"].items():
+        spreads = (_row(row[name], ("p50", "max"), 2) for name in ("away_s", "back_s"))
+        table.add_row(kind, str(row["events"]), str(row["failed"]), *spreads)
+    console.print(table)
+    failures = [
+        f"run {row['run']}, {row['kind']} {row['process']}: {problem}"
+        for row in figures["rows"]
+        for problem in row["problems"]
+    ]
+    left_out = [f"{kind} is left out: {why}" for kind, why in figures["skipped"].items()]
+    for line in (*failures, *figures["problems"], *left_out):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    console.print(
+        f"{figures['machine']}; poses said to be tracking that were wrong: {figures['wrong']}", highlight=False
+    )

@@ -13,6 +13,7 @@ import tyro
 
 from fieldpose.deploy.benchmarks import tables
 from fieldpose.deploy.benchmarks.isa import Isa, limited_to
+from fieldpose.deploy.commands.bench_chaos import Chaos
 from fieldpose.deploy.commands.bench_mesh import Mesh
 from fieldpose.deploy.commands.bench_record import Record
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
@@ -295,6 +296,7 @@ class Options:
         | Annotated[Track, tyro.conf.subcommand("track")]
         | Annotated[Start, tyro.conf.subcommand("start")]
         | Annotated[Mesh, tyro.conf.subcommand("mesh")]
+        | Annotated[Chaos, tyro.conf.subcommand("chaos")]
     ]
 
     def run(self) -> int:

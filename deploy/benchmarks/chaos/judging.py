@@ -34,6 +34,12 @@ class Verdict:
     without_pose: int = 0
     problems: list[str] = field(default_factory=list)
 
+    def judge_time(self) -> None:
+        """One more problem where tracking was not back in time."""
+        if self.back_s is None or self.back_s > IN_TIME_S:
+            late = "never" if self.back_s is None else f"after {self.back_s:.1f} s"
+            self.problems.append(f"tracks again {late}")
+
     @property
     def row(self) -> dict[str, Any]:
         """As the JSON file has it."""
@@ -85,17 +91,27 @@ def is_tracked(frame: FrameResult) -> bool:
     return frame.cam_from_object is not None and frame.state == TrackingState.TRACKING
 
 
-def wrong(frames: Sequence[FrameResult], limit: Limit) -> list[int]:
-    """Numbers of the frames that are said to be TRACKING at a pose, measured or carried on, beyond the limit."""
-    return [frame.frame_id for frame in frames if frame.state == TrackingState.TRACKING and _is_wrong(frame, limit)]
+@dataclass(frozen=True)
+class Wrong:
+    """A pose that was said to be TRACKING and was not where the camera is; carried: it was not measured."""
+
+    frame_id: int
+    rotation_error_deg: float
+    translation_error: float
+    carried: bool
 
 
-def _is_wrong(frame: FrameResult, limit: Limit) -> bool:
-    pose = frame.cam_from_object if frame.cam_from_object is not None else frame.carried
-    if pose is None or frame.true_pose is None:
-        return False
-    turn, shift = rotation_error_deg(pose, frame.true_pose), translation_error(pose, frame.true_pose)
-    return bool(turn > limit.angle_deg or shift > limit.distance)
+def wrong(frames: Sequence[FrameResult], limit: Limit) -> list[Wrong]:
+    """The poses, measured or carried on, that are said to be TRACKING and are beyond the limit."""
+    found = []
+    for frame in frames:
+        pose = frame.cam_from_object if frame.cam_from_object is not None else frame.carried
+        if frame.state != TrackingState.TRACKING or pose is None or frame.true_pose is None:
+            continue
+        turn, shift = rotation_error_deg(pose, frame.true_pose), translation_error(pose, frame.true_pose)
+        if turn > limit.angle_deg or shift > limit.distance:
+            found.append(Wrong(frame.frame_id, float(turn), float(shift), frame.cam_from_object is None))
+    return found
 
 
 def _of_event(done: Done, frames: Sequence[FrameResult], until_ns: int | None) -> Verdict:
@@ -105,9 +121,7 @@ def _of_event(done: Done, frames: Sequence[FrameResult], until_ns: int | None) -
         return verdict
     verdict.away_s = (done.gone_ns - done.at_ns) / 1e9
     verdict.back_s = back_s(frames, done.gone_ns, until_ns)
-    if verdict.back_s is None or verdict.back_s > IN_TIME_S:
-        late = "never" if verdict.back_s is None else f"after {verdict.back_s:.1f} s"
-        verdict.problems.append(f"tracks again {late}")
+    verdict.judge_time()
     back_ns = done.gone_ns + int((verdict.back_s or 0.0) * 1e9)
     verdict.without_pose = sum(done.at_ns <= frame.capture_ns <= back_ns and not is_tracked(frame) for frame in frames)
     return verdict

@@ -12,7 +12,7 @@ import psutil
 from fieldpose.bus.recording import RecordingWriter, partial_path
 from fieldpose.deploy.benchmarks.chaos.events import Event, Kind, Round
 from fieldpose.deploy.benchmarks.chaos.injector import Injector
-from fieldpose.deploy.benchmarks.chaos.judging import Verdict, judged, wrong
+from fieldpose.deploy.benchmarks.chaos.judging import Verdict, Wrong, back_s, judged, wrong
 from fieldpose.deploy.benchmarks.sequences import Sequence as Followed
 from fieldpose.deploy.commands.run import planned
 from fieldpose.deploy.evaluation.film import FrameLog
@@ -29,11 +29,10 @@ _RATE_HZ = 30.0
 
 @dataclass
 class Played:
-    """What a round has shown. wrong: numbers of frames; problems: those of the run as a whole; left: events that its
-    source was too short for; lost, recorded: messages."""
+    """What a round has shown. problems: those of the run as a whole; left: events that its source was too short for."""
 
     verdicts: list[Verdict]
-    wrong: list[int] = field(default_factory=list)
+    wrong: list[Wrong] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     left: Sequence[Event] = ()
     frames: int = 0
@@ -87,12 +86,9 @@ def _went_on(one: Round, injector: Injector, outcome: RunResult, followed: Follo
 
 def _started(event: Event, outcome: RunResult) -> Verdict:
     """A start in another order: all the first frames must be there, and no process may have fallen."""
-    from fieldpose.deploy.benchmarks.chaos.judging import IN_TIME_S, back_s
-
     sent = [frame.sent_ns for frame in outcome.frames if frame.sent_ns is not None]
     verdict = Verdict(event, back_s(outcome.frames, min(sent, default=0)), outcome.start_s)
-    if verdict.back_s is None or verdict.back_s > IN_TIME_S:
-        verdict.problems.append("tracks too late, or not at all")
+    verdict.judge_time()
     if outcome.faults:
         verdict.problems.append(f"{len(outcome.faults)} processes fell")
     return verdict

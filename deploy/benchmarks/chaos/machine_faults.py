@@ -1,0 +1,199 @@
+"""What can go wrong with that on which processes stand: the link between two hosts is cut, the disk is full.
+
+Both need rights that root has, on Linux. Hosts are network namespaces of this machine.
+"""
+
+from __future__ import annotations
+
+import csv
+import secrets
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from fieldpose.bus.recording import partial_path, recover
+from fieldpose.bus.replay import info
+from fieldpose.deploy.benchmarks.chaos.events import PAUSE_S, Event, Kind
+from fieldpose.deploy.benchmarks.chaos.judging import Verdict, back_s
+from fieldpose.deploy.benchmarks.chaos.rounds import Played
+from fieldpose.deploy.benchmarks.sequences import Sequence as Followed
+from fieldpose.deploy.reporting.results import FrameResult
+from fieldpose.errors import FieldposeError
+
+_FIELDPOSE = (sys.executable, "-P", "-m", "fieldpose")
+_DISK_MB = 16
+_DISK_FRAMES = 300
+_PORT = 7447
+_READY_S, _BEFORE_S, _AFTER_S, _END_S = 120.0, 4.0, 4.0, 20.0
+
+
+def missing_rights() -> dict[Kind, str]:
+    """What cannot be done here, and why."""
+    found = {}
+    for kind, tries in ((Kind.CUT, _two_hosts), (Kind.FULL, _small_disk)):
+        try:
+            with tries():
+                pass
+        except (OSError, subprocess.CalledProcessError) as error:
+            said = getattr(error, "stderr", None) or b""
+            found[kind] = said.decode(errors="replace").strip() or str(error)
+    return found
+
+
+def cut(source: Path, followed: Followed) -> Played:
+    """The camera on one host, everything else on another, and no link between them for PAUSE_S."""
+    verdict = Verdict(Event(Kind.CUT), away_s=PAUSE_S)
+    with _two_hosts() as hosts, tempfile.TemporaryDirectory(prefix="fieldpose-chaos-") as folder:
+        rows = Path(folder) / "run.csv"
+        hub = f"tcp/{hosts.stages_at}:{_PORT}"
+        with ExitStack() as closing:
+            run = closing.enter_context(
+                _started(hosts.stages, "run", followed.field, "--source", "bus", "--listen", hub, "--csv", rows)
+            )
+            _wait_for_line(run, "running\n")
+            there = ("--connect", hub, "--listen", f"tcp/{hosts.camera_at}:0", "--field", followed.field)
+            closing.enter_context(
+                _started(hosts.camera, "stage", "camera", *there, "--camera.source", f"mcap:{source}")
+            )
+            time.sleep(_BEFORE_S)
+            began_ns = time.time_ns()
+            hosts.link("down")
+            time.sleep(PAUSE_S)
+            hosts.link("up")
+            gone_ns = time.time_ns()
+            time.sleep(_AFTER_S)
+        frames, wrong = _read(rows, followed)
+    verdict.back_s = back_s(frames, gone_ns)
+    numbers = [frame.frame_id for frame in frames]
+    verdict.without_pose = max(numbers, default=0) - min(numbers, default=0) + 1 - len(numbers)
+    verdict.judge_time()
+    if not any(frame.capture_ns < began_ns for frame in frames):
+        verdict.problems.append("nothing was tracked before")
+    return Played([verdict], wrong, frames=len(frames))
+
+
+def full(source: Path, followed: Followed) -> Played:
+    """A recording that outgrows its disk: tracking goes on, one line tells it, and what was written can be read."""
+    verdict = Verdict(Event(Kind.FULL))
+    with _small_disk() as disk, tempfile.TemporaryDirectory(prefix="fieldpose-chaos-") as folder:
+        recording, rows = disk / "run.mcap", Path(folder) / "run.csv"
+        arguments = ("--source", f"mcap:{source}", "--camera.frames", _DISK_FRAMES, "--record", recording)
+        done = subprocess.run(
+            _command("run", followed.field, *arguments, "--csv", rows), capture_output=True, text=True, timeout=_READY_S
+        )
+        said = [line for line in done.stderr.splitlines() if line.startswith("fieldpose: ")]
+        if done.returncode == 0 or len(said) != 1 or "No space left" not in said[0]:
+            verdict.problems.append(f"exit code {done.returncode}, and said {said}")
+        try:
+            if not _readable(recording, Path(folder) / "saved.mcap"):
+                verdict.problems.append("nothing can be read of the recording")
+        except FieldposeError as error:
+            verdict.problems.append(f"the recording cannot be read: {error}")
+    return Played([verdict])
+
+
+def _readable(recording: Path, saved: Path) -> int:
+    """How many messages a recording holds, or what can be saved of it."""
+    unfinished = partial_path(recording)
+    return recover(unfinished, saved) if unfinished.exists() else info(recording).messages
+
+
+@dataclass(frozen=True)
+class _Hosts:
+    camera: str
+    stages: str
+    camera_at: str
+    stages_at: str
+
+    def link(self, state: str) -> None:
+        _ip("-n", self.camera, "link", "set", "veth0", state)
+
+
+@contextmanager
+def _two_hosts() -> Iterator[_Hosts]:
+    mark = secrets.token_hex(2)
+    camera, stages = f"fieldpose-{mark}-a", f"fieldpose-{mark}-b"
+    net = f"10.{int(mark[:2], 16)}.{int(mark[2:], 16)}"
+    hosts = _Hosts(camera, stages, f"{net}.1", f"{net}.2")
+    with ExitStack() as closing:
+        for name in (camera, stages):
+            _ip("netns", "add", name)
+            closing.callback(_ip, "netns", "del", name)
+        _ip("link", "add", "veth0", "netns", camera, "type", "veth", "peer", "name", "veth0", "netns", stages)
+        for name, address in ((camera, hosts.camera_at), (stages, hosts.stages_at)):
+            _ip("-n", name, "addr", "add", f"{address}/24", "dev", "veth0")
+            for device in ("lo", "veth0"):
+                _ip("-n", name, "link", "set", device, "up")
+        yield hosts
+
+
+@contextmanager
+def _small_disk() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="fieldpose-disk-") as folder:
+        subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", f"size={_DISK_MB}m", "tmpfs", folder], check=True, capture_output=True
+        )
+        try:
+            yield Path(folder)
+        finally:
+            subprocess.run(["umount", folder], check=True, capture_output=True)
+
+
+def _ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True, capture_output=True)
+
+
+def _command(*arguments: object) -> list[str]:
+    return [*_FIELDPOSE, *map(str, arguments)]
+
+
+@contextmanager
+def _started(host: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
+    command = ["ip", "netns", "exec", host, *_command(*arguments)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.communicate(timeout=_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.communicate()
+
+
+def _wait_for_line(process: subprocess.Popen[str], end: str) -> None:
+    assert process.stderr is not None
+    for line in process.stderr:
+        if line.endswith(end):
+            return
+    raise FieldposeError("bench chaos: the run on the other host did not start")
+
+
+def _read(rows: Path, followed: Followed) -> tuple[list[FrameResult], list[int]]:
+    """When each frame was answered and with what state, as the run has written it; numbers of those that were wrong."""
+    frames, wrong = [], []
+    with rows.open(newline="") as file:
+        for row in csv.DictReader(file):
+            number, capture_ns = int(row["frame_id"]), int(row["capture_ns"])
+            frame = FrameResult(number, capture_ns, "finished", state=row["state"] or None)
+            if row["cam_from_object_00"] and row["latency_ms"]:
+                answered_ns = capture_ns + int(float(row["latency_ms"]) * 1e6)
+                frame = replace(frame, cam_from_object=np.eye(4), answered_ns=answered_ns)
+            frames.append(frame)
+            if row["state"] == "tracking" and row["rotation_error_deg"] and _beyond(row, followed):
+                wrong.append(number)
+    return frames, wrong
+
+
+def _beyond(row: dict[str, str], followed: Followed) -> bool:
+    turn, shift = float(row["rotation_error_deg"]), float(row["translation_error"])
+    return turn > followed.limit.angle_deg or shift > followed.limit.distance

@@ -14,7 +14,9 @@ from fieldpose.stages.geometry import Limit
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 
 DEMO, KITCHEN = "demo", "kitchen"
-_DEMO_LIMIT, _LIMIT = Limit(1.0, 0.02), Limit(2.0, 0.05)
+LIMIT = Limit(2.0, 0.05)
+"""A pose beyond is wrong, where a sequence has no limit of its own."""
+_DEMO_LIMIT = Limit(1.0, 0.02)
 _SIZE = 400
 
 
@@ -25,7 +27,7 @@ class Sequence:
     name: str
     recording: Path
     field: Path
-    limit: Limit = _LIMIT
+    limit: Limit = LIMIT
 
 
 @dataclass(frozen=True)

@@ -300,5 +300,5 @@ def print_chaos(figures: dict[str, Any]) -> None:
     for line in (*failures, *figures["problems"], *left_out):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     console.print(
-        f"{figures['machine']}; poses said to be tracking that were wrong: {figures['wrong']}", highlight=False
+        f"{figures['machine']}; poses said to be tracking that were wrong: {len(figures['wrong'])}", highlight=False
     )

@@ -7,8 +7,8 @@ The figures, which programs may rely on:
                      or because the process was replaced), back_s (from there until half a second was tracked),
                      frames_without_pose (from the event until then), problems (in words)
   kinds              "kind process" -> events, failed, away_s and back_s (p50 and max)
-  wrong              poses that were said to be TRACKING beyond the sequence's limit: run, frame_id, rotation_error_deg,
-                     translation_error, carried (it was not measured)
+  wrong              poses that were said to be TRACKING beyond 2 degrees or 0.05 units: run, frame_id,
+                     rotation_error_deg, translation_error, carried (it was not measured)
   frames             of all runs
   problems           what runs left behind, each with the number of its run
   skipped            kind -> why this machine cannot do it

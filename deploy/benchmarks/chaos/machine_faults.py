@@ -19,10 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fieldpose.bus.messages import TrackingState
 from fieldpose.bus.recording import partial_path, recover
 from fieldpose.bus.replay import info
 from fieldpose.deploy.benchmarks.chaos.events import PAUSE_S, Event, Kind
-from fieldpose.deploy.benchmarks.chaos.judging import Verdict, back_s
+from fieldpose.deploy.benchmarks.chaos.judging import Verdict, Wrong, back_s
 from fieldpose.deploy.benchmarks.chaos.rounds import Played
 from fieldpose.deploy.benchmarks.sequences import Sequence as Followed
 from fieldpose.deploy.reporting.results import FrameResult
@@ -60,9 +61,8 @@ def cut(source: Path, followed: Followed) -> Played:
             )
             _wait_for_line(run, "running\n")
             there = ("--connect", hub, "--listen", f"tcp/{hosts.camera_at}:0", "--field", followed.field)
-            closing.enter_context(
-                _started(hosts.camera, "stage", "camera", *there, "--camera.source", f"mcap:{source}")
-            )
+            film = ("--camera.source", f"mcap:{source}")
+            closing.enter_context(_started(hosts.camera, "stage", "camera", *there, *film))
             time.sleep(_BEFORE_S)
             began_ns = time.time_ns()
             hosts.link("down")
@@ -178,8 +178,8 @@ def _wait_for_line(process: subprocess.Popen[str], end: str) -> None:
     raise FieldposeError("bench chaos: the run on the other host did not start")
 
 
-def _read(rows: Path, followed: Followed) -> tuple[list[FrameResult], list[int]]:
-    """When each frame was answered and with what state, as the run has written it; numbers of those that were wrong."""
+def _read(rows: Path, followed: Followed) -> tuple[list[FrameResult], list[Wrong]]:
+    """When each frame was answered and with what state, as the run has written it; those that were wrong."""
     frames, wrong = [], []
     with rows.open(newline="") as file:
         for row in csv.DictReader(file):
@@ -189,11 +189,8 @@ def _read(rows: Path, followed: Followed) -> tuple[list[FrameResult], list[int]]
                 answered_ns = capture_ns + int(float(row["latency_ms"]) * 1e6)
                 frame = replace(frame, cam_from_object=np.eye(4), answered_ns=answered_ns)
             frames.append(frame)
-            if row["state"] == "tracking" and row["rotation_error_deg"] and _beyond(row, followed):
-                wrong.append(number)
+            if row["state"] == TrackingState.TRACKING and row["rotation_error_deg"]:
+                turn, shift = float(row["rotation_error_deg"]), float(row["translation_error"])
+                if turn > followed.limit.angle_deg or shift > followed.limit.distance:
+                    wrong.append(Wrong(number, turn, shift, carried=False))
     return frames, wrong
-
-
-def _beyond(row: dict[str, str], followed: Followed) -> bool:
-    turn, shift = float(row["rotation_error_deg"]), float(row["translation_error"])
-    return turn > followed.limit.angle_deg or shift > followed.limit.distance

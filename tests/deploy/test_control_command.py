@@ -188,14 +188,18 @@ def test_the_public_interface_asks_too(hub: str) -> None:
         assert pipeline.values().requests == 2
 
 
-def test_a_run_says_once_where_its_hub_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_says_once_where_its_hub_is_and_who_was_hung(capsys: pytest.CaptureFixture[str]) -> None:
     with live_line("film") as report:
         for _ in range(3):
             report(Progress("starting", ("pnp",), hub="tcp/127.0.0.1:41234"))
-        report(Progress("running"))
+        for hung in ((), ("matching",), ("matching",), ("matching", "pnp")):
+            report(Progress("running", hung=hung))
     printed = capsys.readouterr()
     assert printed.out == ""
-    assert printed.err.splitlines() == ["film: hub tcp/127.0.0.1:41234", "film: starting", "film: running"]
+    assert printed.err.splitlines() == [
+        "film: hub tcp/127.0.0.1:41234", "film: starting", "film: running",
+        *(f"film: {name} hung, was killed and is started again" for name in ("matching", "pnp")),
+    ]  # fmt: skip
 
 
 def hub_of(lines: Iterable[str]) -> str:

@@ -32,6 +32,8 @@ from fieldpose.bus.topics import (
 )
 from fieldpose.deploy.graph import STAGES
 from fieldpose.deploy.processes.collector import Collector
+from fieldpose.deploy.processes.liveness import Fault
+from fieldpose.deploy.reporting.report import rows
 from fieldpose.deploy.reporting.results import FrameResult, RunResult, TruthKnown, accuracy, rate_hz, summarise, to_csv
 from fieldpose.stages.geometry import Similarity, exp_se3, rotation_about
 
@@ -244,3 +246,18 @@ def test_frames_that_the_command_has_not_heard_count_as_sent() -> None:
     assert collector.sent == 5
     assert len(collector.results()) == 2
     collector.close()
+
+
+def test_a_fault_is_told_with_how_long_and_how_many_frames_it_cost() -> None:
+    pose = np.eye(4)
+    frames = [
+        FrameResult(i, i * 10**9, "finished", sent_ns=i * 10**9, cam_from_object=None if 3 <= i <= 5 else pose)
+        for i in range(1, 9)
+    ]
+    faults = [Fault("tracking", "hung", 2 * 10**9, 6 * 10**9), Fault("pnp", "ended", 7 * 10**9)]
+    first, second = summarise(RunResult(frames, faults=faults))["faults"]
+    assert first == {"process": "tracking", "what": "hung", "at_s": 1.0, "away_s": 4.0, "frames_without_pose": 3}
+    assert second == {"process": "pnp", "what": "ended", "at_s": 6.0, "away_s": None, "frames_without_pose": 0}
+    told = dict(rows(summarise(RunResult(frames, faults=faults))))
+    assert told["tracking hung and was replaced"] == "back after 4.0 s, 3 frames without a pose"
+    assert told["pnp ended unasked"] == "not back, 0 frames without a pose"

@@ -124,3 +124,72 @@ def test_a_folder_too_deep_for_a_socket_is_told(tmp_path: Path) -> None:
     folder.mkdir()
     with pytest.raises(ProcessError, match="too long a path for a socket"), Supervisor(folder, []):
         pass
+
+
+def of_session(tmp_path: Path) -> int:
+    return int((tmp_path / "supervisord.pid").read_text())
+
+
+def is_running(pid: int) -> bool:
+    return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+
+
+def signalled_in_the_end(folder: Path, programs: list[Program], number: signal.Signals) -> tuple[str, list[int]]:
+    """What is said where supervisord gets a signal while its programs run, and their process ids."""
+    pids: list[int] = []
+
+    def run() -> None:
+        with Supervisor(folder, programs) as supervisor:
+            until(lambda: all("up" in supervisor.last_line(program.name) for program in programs))
+            processes = supervisor.poll()
+            pids.extend(process.pid for process in processes.values())
+            os.kill(processes[programs[-1].name].pid, signal.SIGSTOP)
+            os.kill(of_session(folder), number)
+            until(lambda: not supervisor.poll())
+
+    with pytest.raises(ProcessError) as raised:
+        run()
+    return str(raised.value), pids
+
+
+def test_where_the_supervisor_is_killed_one_line_tells_it_and_nothing_is_left(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fieldpose.deploy.processes.supervision._FINISH_S", 0.5)
+    programs = [python("good", SLEEP), python("bad", STUBBORN), python("stopped", SLEEP)]
+    said, pids = signalled_in_the_end(tmp_path, programs, signal.SIGKILL)
+    assert said == "supervisord, which looks after the processes, was killed by SIGKILL; the run is over"
+    assert len(pids) == 3
+    assert not any(map(is_running, pids))
+
+
+def test_a_supervisor_that_is_stopped_for_good_is_no_longer_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, seconds in (("_CALL_S", 0.1), ("_ANSWER_S", 0.5), ("_FINISH_S", 0.5)):
+        monkeypatch.setattr(f"fieldpose.deploy.processes.supervision.{name}", seconds)
+    said, pids = signalled_in_the_end(tmp_path, [python("a", SLEEP)], signal.SIGSTOP)
+    assert said.startswith("supervisord, which looks after the processes, is hung: no answer for ")
+    assert not any(map(is_running, pids))
+
+
+def test_a_supervisor_that_is_stopped_for_a_while_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fieldpose.deploy.processes.supervision._CALL_S", 0.1)
+    with Supervisor(tmp_path, [python("a", SLEEP)]) as supervisor:
+        until(lambda: supervisor.poll()["a"].state == "RUNNING")
+        before = supervisor.poll()
+        os.kill(of_session(tmp_path), signal.SIGSTOP)
+        assert supervisor.poll() == before
+        os.kill(of_session(tmp_path), signal.SIGCONT)
+        supervisor.kill("a")
+        until(lambda: supervisor.poll()["a"].pid not in (0, before["a"].pid))
+
+
+def test_programs_are_started_in_the_order_given(tmp_path: Path) -> None:
+    code = "import sys, time; sys.stdout.write('up'); sys.stdout.flush(); time.sleep(60)"
+    with Supervisor(tmp_path, [python(name, code) for name in "cab"]) as supervisor:
+        until(lambda: all(process.pid for process in supervisor.poll().values()) and supervisor.poll())
+        pids = {name: process.pid for name, process in supervisor.poll().items()}
+    assert sorted(pids, key=lambda name: pids[name]) == list("cab")

@@ -18,7 +18,7 @@ from fieldpose.deploy.benchmarks.chaos.events import PAUSE_S, SUPERVISOR, Event,
 from fieldpose.deploy.processes.pipeline import Progress
 
 _WELL_S = 1.0
-_SETTLED_S = 2.5
+SETTLED_S = 2.5
 """After the cause is gone, until the next one: longer than tracking may take."""
 _PATIENCE_S = 30.0
 """It goes on all the same after so long."""
@@ -37,15 +37,15 @@ class Done:
 class Injector:
     """Looks at a run's progress; ends the run, as a Ctrl-C would, once all events are done.
 
-    segments, folder: what the processes of the run have used of shared memory, and where they kept their files.
+    settled_s: from when a cause is gone until the next event at the soonest. segments, folder: what the processes of the run have used of shared memory, and where they kept their files.
     """
 
-    def __init__(self, events: Sequence[Event]) -> None:
+    def __init__(self, events: Sequence[Event], settled_s: float = SETTLED_S) -> None:
         self.done: list[Done] = []
         self.segments: set[Path] = set()
         self.folder: Path | None = None
         self.stopped = False
-        self._left = list(events)
+        self._left, self._settled_s = list(events), settled_s
         self._well_since: float | None = None
         self._gone_at = self._began = time.monotonic()
         self._hung_before = 0
@@ -62,7 +62,7 @@ class Injector:
         elif self._left and self._ready(now):
             self._look_around(progress)
             self._bring_about(self._left.pop(0), progress)
-        elif not self._left and now - self._gone_at > _SETTLED_S and not self.stopped:
+        elif not self._left and now - self._gone_at > self._settled_s and not self.stopped:
             self._look_around(progress)
             self.stopped = True
             signal.raise_signal(signal.SIGINT)
@@ -83,7 +83,7 @@ class Injector:
     def _ready(self, now: float) -> bool:
         if now - self._gone_at > _PATIENCE_S:
             return True
-        settled = not self.done or now - self._gone_at > _SETTLED_S
+        settled = not self.done or now - self._gone_at > self._settled_s
         wait_s = self._left[0].wait_s + (_WELL_S if self.done else 0.0)
         return settled and self._well_since is not None and now - self._well_since > wait_s
 

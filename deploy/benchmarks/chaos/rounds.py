@@ -11,7 +11,7 @@ import psutil
 
 from fieldpose.bus.recording import RecordingWriter, partial_path
 from fieldpose.deploy.benchmarks.chaos.events import Event, Kind, Round
-from fieldpose.deploy.benchmarks.chaos.injector import Injector
+from fieldpose.deploy.benchmarks.chaos.injector import SETTLED_S, Injector
 from fieldpose.deploy.benchmarks.chaos.judging import Verdict, Wrong, back_s, judged, wrong
 from fieldpose.deploy.benchmarks.sequences import Sequence as Followed
 from fieldpose.deploy.commands.run import planned
@@ -56,9 +56,12 @@ def plan_of(followed: Followed, source: Path) -> Plan:
     return planned(replace(Settings(), camera=CameraConfig(f"mcap:{source}")), followed.field)
 
 
-def play(one: Round, source: Path, followed: Followed) -> Played:
-    """Run the pipeline while the events of a round happen, and judge. Raises KeyboardInterrupt after a Ctrl-C."""
-    injector = Injector([event for event in one.events if event.kind is not Kind.ORDER])
+def play(one: Round, source: Path, followed: Followed, settled_s: float = SETTLED_S) -> Played:
+    """Run the pipeline while the events of a round happen, and judge. Raises KeyboardInterrupt after a Ctrl-C.
+
+    settled_s: see Injector.
+    """
+    injector = Injector([event for event in one.events if event.kind is not Kind.ORDER], settled_s)
     with tempfile.TemporaryDirectory(prefix="fieldpose-chaos-") as folder:
         recording = Path(folder) / "run.mcap"
         run = Run((plan_of(followed, source),), recording, order=one.order)

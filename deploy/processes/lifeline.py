@@ -9,6 +9,8 @@ import sys
 
 PARENT = "FIELDPOSE_PARENT_PID"
 """Environment variable with the process id of the parent."""
+TEMPORARY = "--temporary"
+"""Tells a supervisor to remove its folder where its parent is gone."""
 
 _PR_SET_PDEATHSIG = 1
 

@@ -117,7 +117,7 @@ def run_pipelines(run: Run, report: Report = lambda progress: None) -> list[RunR
         at = Joint(hub, None if keys is None else access_as(keys, OBSERVER))
         made = programs(run.plans, folder, hub, run.record, run.recording, keys)
         made.sort(key=lambda program: run.order.index(program.name) if program.name in run.order else len(run.order))
-        with removed_orphans(), Supervisor(folder, made, preloading(folder)) as supervisor:
+        with removed_orphans(), Supervisor(folder, made, preloading(folder), run.logs is None) as supervisor:
             return _Running(run, supervisor, at, signals, report).run()
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 from fieldpose.deploy.graph import thread_environment
 from fieldpose.deploy.processes.configuration import USER_ERROR, Program, configuration
-from fieldpose.deploy.processes.lifeline import PARENT
+from fieldpose.deploy.processes.lifeline import PARENT, TEMPORARY
 from fieldpose.deploy.processes.rpc import Transport
 from fieldpose.deploy.processes.sessions import end_session
 from fieldpose.errors import ProcessError
@@ -27,6 +27,7 @@ __all__ = ["USER_ERROR", "ProcessInfo", "Program", "Supervisor"]
 
 _LONGEST_SOCKET_PATH = 100
 _ANSWER_S = 10.0
+_HUNG_S = 10.0
 _CALL_S = 1.0
 """A call that takes longer is made again, so that whoever waits for it can look after other things."""
 _FINISH_S = 5.0
@@ -60,17 +61,21 @@ class Supervisor:
     """Runs programs while the context lasts; `folder` gets the configuration, a socket, and a log of each.
 
     prepare: a function as "module:name" and its arguments, called by supervisord before it starts anything; programs
-    that begin with `forking.FIELDPOSE` are then forked from it.
+    that begin with `forking.FIELDPOSE` are then forked from it. temporary: where this process is killed, so that it
+    cannot remove the folder, supervisord does.
 
     A program that ends with USER_ERROR stays down, and so does one that has done its work; any other end brings it
     back. All of them end with this process, even if it is killed. Raises ProcessError where supervisord does not
     come up.
     """
 
-    def __init__(self, folder: Path, programs: Sequence[Program], prepare: Sequence[str] = ()) -> None:
+    def __init__(
+        self, folder: Path, programs: Sequence[Program], prepare: Sequence[str] = (), temporary: bool = False
+    ) -> None:
         self.restarts: dict[str, int] = {}
         self._folder = folder = folder.resolve()
         self._programs, self._prepare, self._answered = programs, prepare, False
+        self._flags = [TEMPORARY] if temporary else []
         self._socket = folder / "supervisor.sock"
         self._pids: dict[str, int] = {}
         self._infos: dict[str, ProcessInfo] = {}
@@ -86,7 +91,7 @@ class Supervisor:
         config.write_text(configuration(self._programs), encoding="utf-8")
         with (self._folder / "supervisord.out").open("wb") as output:
             self._daemon = subprocess.Popen(
-                [*_SUPERVISORD, str(config), *self._prepare],
+                [*_SUPERVISORD, *self._flags, str(config), *self._prepare],
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 cwd=self._folder,
@@ -195,7 +200,7 @@ class Supervisor:
         except TimeoutError:
             self._transport.close()
             silent_s = time.monotonic() - self._heard_s
-            if silent_s > _ANSWER_S:
+            if silent_s > _HUNG_S:
                 raise ProcessError(
                     f"supervisord, which looks after the processes, is hung: no answer for {silent_s:.0f} s; the run is"
                     " over"

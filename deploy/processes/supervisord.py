@@ -9,15 +9,18 @@ from __future__ import annotations
 import gc
 import importlib
 import os
+import shutil
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from setproctitle import setproctitle
 from supervisor import supervisord
 from supervisor.options import ServerOptions
 
+from fieldpose.bus.segments import removed_orphans
 from fieldpose.deploy.processes.forking import FIELDPOSE, become, can_fork
-from fieldpose.deploy.processes.lifeline import PARENT, die_with_parent
+from fieldpose.deploy.processes.lifeline import PARENT, TEMPORARY, die_with_parent
 
 
 class ForkingOptions(ServerOptions):
@@ -31,9 +34,13 @@ class ForkingOptions(ServerOptions):
         super().execve(filename, argv, env)
 
 
-def main(config: str, prepare: Sequence[str]) -> None:
-    """Serve a configuration; `prepare` is a function, as "module:name", and what it is called with before."""
+def main(config: str, prepare: Sequence[str], temporary: bool = False) -> None:
+    """Serve a configuration; `prepare` is a function, as "module:name", and what it is called with before.
+
+    temporary: where the parent was killed in the meantime, what it would have removed is removed here.
+    """
     die_with_parent()
+    parent = os.getppid()
     # It finds the place of the title only while the environment is as it was.
     setproctitle(f"fieldpose supervisord -c {config}")
     # For this process alone: its children have another parent.
@@ -47,6 +54,10 @@ def main(config: str, prepare: Sequence[str]) -> None:
     supervisord.go(options)
     options.close_httpservers()
     options.close_logger()
+    if temporary and os.getppid() != parent:
+        shutil.rmtree(Path(config).parent, ignore_errors=True)
+        with removed_orphans():
+            pass
 
 
 def _call(function: str, *arguments: str) -> None:
@@ -59,4 +70,5 @@ def _call(function: str, *arguments: str) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2:])
+    arguments = [argument for argument in sys.argv[1:] if argument != TEMPORARY]
+    main(arguments[0], arguments[1:], temporary=TEMPORARY in sys.argv[1:])

@@ -83,13 +83,16 @@ def test_those_that_do_not_listen_are_killed_after_the_timeout(tmp_path: Path) -
         until(lambda: not psutil.pid_exists(pid))
 
 
-def test_all_end_when_whoever_started_them_is_killed(tmp_path: Path) -> None:
+def test_all_end_when_whoever_started_them_is_killed_and_no_temporary_folder_is_left(tmp_path: Path) -> None:
+    folder = tmp_path / "temporary"
+    folder.mkdir()
     code = f"""
 import sys, time
 from pathlib import Path
 from fieldpose.deploy.processes.supervision import Program, Supervisor
 if __name__ == "__main__":
-    with Supervisor(Path({str(tmp_path)!r}), [Program("a", [sys.executable, "-c", {SLEEP!r}])]) as supervisor:
+    programs = [Program("a", [sys.executable, "-c", {SLEEP!r}])]
+    with Supervisor(Path({str(folder)!r}), programs, temporary=True) as supervisor:
         while not supervisor.poll()["a"].pid:
             time.sleep(0.02)
         print(supervisor.poll()["a"].pid, flush=True)
@@ -101,6 +104,7 @@ if __name__ == "__main__":
     parent.kill()
     parent.wait()
     until(lambda: not psutil.pid_exists(child))
+    until(lambda: not folder.exists())
 
 
 def test_the_environment_reaches_the_process_and_odd_characters_survive(
@@ -166,7 +170,7 @@ def test_where_the_supervisor_is_killed_one_line_tells_it_and_nothing_is_left(
 def test_a_supervisor_that_is_stopped_for_good_is_no_longer_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name, seconds in (("_CALL_S", 0.1), ("_ANSWER_S", 0.5), ("_FINISH_S", 0.5)):
+    for name, seconds in (("_CALL_S", 0.1), ("_HUNG_S", 0.5), ("_FINISH_S", 0.5)):
         monkeypatch.setattr(f"fieldpose.deploy.processes.supervision.{name}", seconds)
     said, pids = signalled_in_the_end(tmp_path, [python("a", SLEEP)], signal.SIGSTOP)
     assert said.startswith("supervisord, which looks after the processes, is hung: no answer for ")

@@ -37,7 +37,8 @@ class Done:
 class Injector:
     """Looks at a run's progress; ends the run, as a Ctrl-C would, once all events are done.
 
-    settled_s: from when a cause is gone until the next event at the soonest. segments, folder: what the processes of the run have used of shared memory, and where they kept their files.
+    settled_s: from when a cause is gone until the next event at the soonest. segments, folder: what the processes of
+    the run have used of shared memory, and where they kept their files.
     """
 
     def __init__(self, events: Sequence[Event], settled_s: float = SETTLED_S) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import psutil
 
-from fieldpose.bus.recording import RecordingWriter, partial_path
+from fieldpose.bus.open_recording import partial_path
+from fieldpose.bus.recording import RecordingWriter
 from fieldpose.deploy.benchmarks.chaos.events import Event, Kind, Round
 from fieldpose.deploy.benchmarks.chaos.injector import SETTLED_S, Injector
 from fieldpose.deploy.benchmarks.chaos.judging import Verdict, Wrong, back_s, judged, wrong

@@ -17,7 +17,7 @@ from typing import Any, TypeVar, get_type_hints
 import msgspec
 
 from fieldpose.bus.topics import Address
-from fieldpose.errors import ConfigError
+from fieldpose.errors import ConfigError, FieldposeError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.following.config import FollowingConfig
 from fieldpose.stages.geometry import Limit
@@ -66,7 +66,7 @@ def read_file(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: no such configuration file") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         kind = "JSON" if path.suffix == ".json" else "TOML"
         raise ConfigError(f"{path}: not a {kind} file ({' '.join(str(error).split())})") from error
     if not isinstance(content, dict):
@@ -95,7 +95,7 @@ def changed(config: T, changes: dict[str, Any], origin: str, place: str = "") ->
             raise ConfigError(f"{origin}: {where}: expected a table of settings, got {value!r}")
     try:
         return dataclasses.replace(config, **new)  # type: ignore[type-var]
-    except ConfigError as error:
+    except FieldposeError as error:
         raise ConfigError(f"{origin}: {error}") from error
 
 

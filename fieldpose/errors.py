@@ -1,8 +1,24 @@
 """The one tree of errors that fieldpose raises on purpose; each message says what was got and how to mend it."""
 
+from __future__ import annotations
+
+import re
+
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]+")
+_LONGEST = 2000
+
+
+def one_line(text: object) -> str:
+    """Text as one line that any terminal shows, whatever is quoted in it from a file; cut off where it is very long."""
+    line = _CONTROL.sub(" ", str(text)[: 2 * _LONGEST]).strip().encode("utf-8", "backslashreplace").decode()
+    return line if len(line) <= _LONGEST else f"{line[:_LONGEST]}…"
+
 
 class FieldposeError(Exception):
-    """Base of every error that is the user's to mend; the command line prints it as one line."""
+    """Base of every error that is the user's to mend; its text is one line."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class CodecError(FieldposeError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 
 import cv2
 import numpy as np
@@ -10,6 +11,12 @@ from PIL import Image
 
 from fieldpose.errors import GeometryError
 from fieldpose.stages.geometry import Camera, shrunk_size
+
+MOST_PIXELS = 120_000_000
+"""Of an image file; reading one takes at most 17 bytes a pixel, 2 GB."""
+# What Pillow says of large or damaged images is said by errors, or is no matter.
+warnings.filterwarnings("ignore", module=r"PIL\.")
+warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
 
 
 def shrunk(image: np.ndarray, longer_side: int) -> np.ndarray:
@@ -32,10 +39,13 @@ def shrunk_with_camera(image: np.ndarray, camera: Camera, longer_side: int | Non
 def decoded(encoding: str, image: np.ndarray, width: int, height: int) -> np.ndarray | None:
     """An image (height, width, 3) uint8 RGB: `rgb8` as it is, else from the bytes (n,) uint8 of a jpeg or png file.
 
-    EXIF orientation is ignored. None where the bytes are no image of that size.
+    EXIF orientation is ignored. None where the bytes are no image of that size, which is seen by their head: another
+    size takes no memory.
     """
     if encoding == "rgb8":
         return image
+    if encoded_size(image) != (width, height):
+        return None
     try:
         bgr = cv2.imdecode(image, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:
@@ -50,7 +60,7 @@ def encoded_size(image: np.ndarray) -> tuple[int, int] | None:
     try:
         with Image.open(io.BytesIO(image.tobytes()), formats=("JPEG", "PNG")) as opened:
             return opened.size
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except Exception:  # Pillow does not tell what its decoders raise
         return None
 
 

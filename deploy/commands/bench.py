@@ -14,6 +14,7 @@ import tyro
 from fieldpose.deploy.benchmarks import tables
 from fieldpose.deploy.benchmarks.isa import Isa, limited_to
 from fieldpose.deploy.commands.bench_chaos import Chaos
+from fieldpose.deploy.commands.bench_fuzz import Fuzz
 from fieldpose.deploy.commands.bench_mesh import Mesh
 from fieldpose.deploy.commands.bench_record import Record
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
@@ -282,7 +283,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Options:
-    """Measure how fast the parts are on this machine; run it while nothing else runs.
+    """Measure how fast the parts are on this machine, or (fuzz) what they can bear; run it while nothing else runs.
 
     Example: fieldpose bench render
     """
@@ -297,6 +298,7 @@ class Options:
         | Annotated[Start, tyro.conf.subcommand("start")]
         | Annotated[Mesh, tyro.conf.subcommand("mesh")]
         | Annotated[Chaos, tyro.conf.subcommand("chaos")]
+        | Annotated[Fuzz, tyro.conf.subcommand("fuzz")]
     ]
 
     def run(self) -> int:

@@ -20,6 +20,7 @@ from fieldpose.stages.nerf.datasets.images import load_photo, orientation, probe
 _EXIF_IFD = 0x8769
 _FOCAL_LENGTH_35MM = 0xA405
 _DIAGONAL_35MM = math.hypot(36.0, 24.0)
+_LONGEST_MM = 1e4
 _ASPECT_TOLERANCE = 0.01
 ONE_LENS = 1.2
 """Focal lengths that differ by more are not those of one lens: fitted ones differ from EXIF's by a few percent, a
@@ -96,9 +97,9 @@ def focal_length_from_exif(path: Path, width: int, height: int) -> float | None:
         with Image.open(path) as image:
             stated = image.getexif().get_ifd(_EXIF_IFD).get(_FOCAL_LENGTH_35MM)
             focal_mm = float(stated or 0)
-    except (OSError, ValueError, TypeError, SyntaxError):
+    except Exception:  # Pillow does not tell what damaged EXIF raises
         return None
-    return focal_mm / _DIAGONAL_35MM * math.hypot(width, height) if focal_mm > 0 else None
+    return focal_mm / _DIAGONAL_35MM * math.hypot(width, height) if 0 < focal_mm < _LONGEST_MM else None
 
 
 def _centred(width: int, height: int, focal: float) -> Camera:

@@ -19,7 +19,7 @@ import yaml
 from fieldpose.errors import FieldposeError, SourceError
 from fieldpose.stages.geometry import Camera
 
-_LARGEST_BYTES = 1 << 20
+_LARGEST_BYTES, _LARGEST_YAML = 1 << 20, 1 << 16
 _OPENCV_CAMERA = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K", "M1")
 _OPENCV_LENS = ("distortion_coefficients", "distCoeffs", "dist_coeffs", "Distortion_Coefficients", "D", "D1")
 _FISHEYE = {"equidistant", "fisheye", "kannala_brandt", "kb4", "opencv_fisheye", "simple_radial_fisheye"}
@@ -42,7 +42,12 @@ _EXPECTED = (
 
 
 class _Yaml(yaml.SafeLoader):
-    """Takes OpenCV's matrices for the mappings that they are."""
+    """Takes OpenCV's matrices for the mappings that they are, and no aliases, by which a few lines become gigabytes."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise ValueError("it refers to other parts of itself (*); write the values out")
+        return super().compose_node(parent, index)
 
 
 _Yaml.add_constructor(
@@ -73,7 +78,10 @@ def read_camera_file(path: Path) -> Camera:
         raise SourceError(f"{path}: cannot be read: {error.strerror}") from error
     try:
         return _camera(_numbers(path, content))
-    except (FieldposeError, LookupError, TypeError, ValueError, RecursionError, yaml.YAMLError, cv2.error) as error:
+    except (
+        FieldposeError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError,
+        yaml.YAMLError, cv2.error,
+    ) as error:  # fmt: skip
         why = f"{error.args[0]} is missing" if isinstance(error, KeyError) else " ".join(str(error).split())
         raise SourceError(f"{path}: no usable camera file ({why}); {_EXPECTED}") from error
 
@@ -98,6 +106,8 @@ def _numbers(path: Path, content: bytes) -> _Numbers:
         return _json(json.loads(text))
     if path.suffix == ".txt":
         return _colmap(text)
+    if len(content) > _LARGEST_YAML:
+        raise ValueError(f"as YAML it has more than {_LARGEST_YAML} bytes")
     # OpenCV writes a directive that YAML has otherwise.
     document = yaml.load("\n".join(line for line in text.splitlines() if not line.startswith("%YAML")), _Yaml)
     if not isinstance(document, dict):
@@ -212,7 +222,10 @@ def _colmap(text: str) -> _Numbers:
 
 
 def _opencv_xml(path: Path) -> _Numbers:
-    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    except SystemError as error:
+        raise ValueError("no XML that OpenCV can read") from error
     try:
         matrix = next((m for n in _OPENCV_CAMERA if (m := storage.getNode(n).mat()) is not None), None)
         lens = next((m for n in _OPENCV_LENS if (m := storage.getNode(n).mat()) is not None), None)

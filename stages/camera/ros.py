@@ -16,7 +16,7 @@ from fieldpose.bus.messages import Encoding
 from fieldpose.errors import SourceError
 from fieldpose.stages.camera.camera_files import camera_of
 from fieldpose.stages.geometry import Camera
-from fieldpose.stages.images import encoded_size
+from fieldpose.stages.images import MOST_PIXELS, encoded_size
 
 IMAGE, COMPRESSED, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
 """Types by the names that ROS 2 has for them."""
@@ -144,7 +144,9 @@ def _compressed(message: Any) -> tuple[np.ndarray, Encoding]:
     known = _COLOURS.get(original.strip()) if original.startswith("bayer_") else None
     if known is None or target.split()[-1:] in (["bgr8"], ["rgb8"], ["mono8"]):
         return file, encoding
-    mosaic = cv2.imdecode(file, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+    size = encoded_size(file)
+    fits = size is not None and size[0] * size[1] <= MOST_PIXELS
+    mosaic = cv2.imdecode(file, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE) if fits else None
     if mosaic is None:
         raise SourceError(f"a compressed image of format {message.format!r} cannot be read")
     return _converted(mosaic, known[2]), "rgb8"

@@ -12,6 +12,7 @@ from fieldpose.stages.alignment.images import FramePyramid
 from fieldpose.stages.following.config import LEVELS
 from fieldpose.stages.following.core import Followed
 from fieldpose.stages.geometry import Camera, unscale_pixels
+from fieldpose.stages.images import encoded_size
 
 See = Callable[[Frame], "FramePyramid | None"]
 
@@ -44,6 +45,8 @@ def _grey(frame: Frame, longer_side: int) -> np.ndarray | None:
         return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     # A reduced image of another size would cover more than the frame does.
     sizes = camera.width, camera.height
+    if encoded_size(image) != sizes:
+        return None
     fitting = (by for by in _REDUCED if max(sizes) >= by * longer_side and all(size % by == 0 for size in sizes))
     by = next(fitting, 1) if frame.encoding == "jpeg" else 1
     flag = _REDUCED.get(by, cv2.IMREAD_GRAYSCALE)

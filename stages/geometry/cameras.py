@@ -26,7 +26,7 @@ from fieldpose.stages.geometry.arrays import (
     Values,
 )
 
-_LARGEST = 16384
+LARGEST_SIDE = 16384
 _UNDISTORTED = (0.0, 0.0, 0.0, 0.0, 0.0)
 _NEWTON_STEPS = 25
 _INVERSE_TOLERANCE_PX = 1e-4
@@ -51,8 +51,8 @@ class Camera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if len(self.distortion) != 5 or not np.all(np.isfinite(numbers)):
             raise GeometryError(f"a camera needs finite intrinsics and five distortion coefficients, got {self}")
-        if not (1 <= self.width <= _LARGEST and 1 <= self.height <= _LARGEST and self.fx > 0 and self.fy > 0):
-            raise GeometryError(f"a camera needs a size of 1 to {_LARGEST} and positive focal lengths, got {self}")
+        if not (1 <= self.width <= LARGEST_SIDE and 1 <= self.height <= LARGEST_SIDE and self.fx > 0 and self.fy > 0):
+            raise GeometryError(f"a camera needs a size of 1 to {LARGEST_SIDE} and positive focal lengths, got {self}")
 
     def matrix(self) -> Matrix3:
         """The intrinsic matrix, distortion left out."""

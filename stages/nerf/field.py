@@ -15,10 +15,12 @@ from safetensors.numpy import save
 from fieldpose.errors import FieldFileError
 from fieldpose.stages.nerf.config import FieldConfig
 from fieldpose.stages.nerf.kernels.types import BLOCK, SH_SIZE, Domain, Net
-from fieldpose.stages.nerf.metadata import FORMAT_VERSION, FieldMetadata, Space
+from fieldpose.stages.nerf.metadata import FORMAT_VERSION, FieldMetadata, Space, checked
 
 DESCRIPTOR_SIZE = 64
 LEARNT = ("table", "w1", "w2", "c1", "c2", "c3")
+_TYPES = {**dict.fromkeys(LEARNT, ("F16", "F32")), "occupied": ("U8",), "descriptors": ("I8",)}
+"""What each array of a file may hold."""
 
 
 @dataclass
@@ -113,7 +115,9 @@ def load_field(path: Path) -> Field:
     metadata = _metadata(path, header)
     try:
         return _assemble(arrays, metadata)
-    except (KeyError, ValueError) as error:
+    except KeyError as error:
+        raise FieldFileError(f"{path}: damaged field file (array {error} is missing); train it again") from error
+    except ValueError as error:
         raise FieldFileError(f"{path}: damaged field file ({error}); train it again") from error
 
 
@@ -127,9 +131,14 @@ def _read(path: Path, arrays: bool = True) -> tuple[dict[str, str], dict[str, np
         raise FieldFileError(f"{path}: no such field file; `fieldpose train DATASET --out {path}` makes one")
     try:
         with safe_open(path, framework="numpy") as file:
-            names = file.keys() if arrays else ()
+            # Only those that are known: of other types numpy has none for some.
+            names = (_TYPES.keys() & file.keys()) if arrays else ()
+            for name in names:
+                stored = file.get_slice(name).get_dtype()
+                if stored not in _TYPES[name]:
+                    raise ValueError(f"array {name} is of {stored}, expected {' or '.join(_TYPES[name])}")
             return file.metadata() or {}, {name: file.get_tensor(name) for name in names}
-    except (SafetensorError, OSError) as error:
+    except (SafetensorError, OSError, ValueError, TypeError, OverflowError) as error:
         raise FieldFileError(f"{path}: not a safetensors field file ({error}); train it again") from error
 
 
@@ -140,21 +149,21 @@ def _metadata(path: Path, header: Mapping[str, str]) -> FieldMetadata:
             f"{path}: field format version {got}, this program reads {FORMAT_VERSION}; train the field again"
         )
     try:
-        return msgspec.json.decode(header["fieldpose"], type=FieldMetadata)
-    except (msgspec.DecodeError, ValueError) as error:
+        return checked(msgspec.json.decode(header["fieldpose"], type=FieldMetadata))
+    except (msgspec.DecodeError, ValueError, OverflowError, RecursionError) as error:
         raise FieldFileError(f"{path}: damaged field file ({error}); train it again") from error
 
 
 def _assemble(arrays: dict[str, np.ndarray], metadata: FieldMetadata) -> Field:
     shapes = learnt_shapes(metadata.config)
-    learnt = {name: np.ascontiguousarray(arrays[name], dtype=np.float32) for name in LEARNT}
-    for name, array in learnt.items():
-        expected = shapes[name]
+    for name in LEARNT:
+        array, expected = arrays[name], shapes[name]
         if array.shape != expected or not np.all(np.isfinite(array)):
             raise ValueError(f"array {name} has shape {array.shape} or values that are not finite, expected {expected}")
-    bits = np.unpackbits(arrays["occupied"], bitorder="little").astype(bool)
+    learnt = {name: np.ascontiguousarray(arrays[name], dtype=np.float32) for name in LEARNT}
+    bits = np.unpackbits(arrays["occupied"].ravel(), bitorder="little").astype(bool)
     n = round(len(bits) ** (1 / 3))
-    if n % BLOCK or n**3 != len(bits):
+    if n < BLOCK or n % BLOCK or n**3 != len(bits):
         raise ValueError(f"array occupied has {len(bits)} bits, expected a cube of cells, in blocks of {BLOCK}")
     occupied = bits.reshape(n, n, n)
     return Field(metadata, net_of(metadata.config, learnt), occupied, _descriptors(arrays, len(metadata.cameras)))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import msgspec
 import numpy as np
 
-from fieldpose.stages.geometry import Camera, Similarity
+from fieldpose.stages.geometry import RIGID_TOLERANCE, Camera, Similarity, is_rigid
+from fieldpose.stages.geometry.rigid import from_rotation
 from fieldpose.stages.nerf.config import FieldConfig
 
 FORMAT_VERSION = 1
@@ -156,3 +158,63 @@ class FieldMetadata(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     trained_steps: int = 0
     made_by: str = ""
     version: int = FORMAT_VERSION
+
+
+_LARGEST = 1e15
+_RANGES: dict[str, tuple[float, float]] = {
+    "config.levels": (1, 32),
+    "config.level_features": (1, 16),
+    "config.log2_table": (1, 24),
+    "config.base_resolution": (1, 1 << 16),
+    "config.finest_resolution": (1, 1 << 20),
+    "config.hidden": (1, 1024),
+    "config.features": (3, 256),
+    "config.colour_hidden": (1, 1024),
+    "config.occupancy_resolution": (8, 1024),
+    "space.scale": (1e-15, _LARGEST),
+    "space.half": (1e-9, 1e9),
+    "space.near": (0, 1e9),
+    "space.far": (1e-9, 1e9),
+    "space.step": (1e-6, 1e9),
+    "frame.scale": (1e-15, _LARGEST),
+    "frame.metres_per_unit": (1e-15, _LARGEST),
+    "metres_per_unit": (1e-15, _LARGEST),
+    "error_scale": (0, _LARGEST),
+    "accuracy.error_scale": (0, _LARGEST),
+    "background": (0, 1),
+}
+"""What numbers of a file may be, those of any build; others are within _LARGEST of zero."""
+
+
+def checked(metadata: FieldMetadata) -> FieldMetadata:
+    """The same, of a field that can be rendered. Raises ValueError for numbers that none can have."""
+    for name, value in _numbers(msgspec.to_builtins(metadata), ""):
+        least, most = _RANGES.get(name, (-_LARGEST, _LARGEST))
+        if not least <= value <= most:
+            raise ValueError(f"{name} is {value:g}, expected {least:g} to {most:g}")
+    space = metadata.space
+    if not space.near < space.far:
+        raise ValueError(f"space.near is {space.near:g}, expected less than space.far, {space.far:g}")
+    corners = space.corners
+    if corners is not None and not (corners[0] < corners[1]).all():
+        raise ValueError(f"space.box is {space.box}, expected its lowest and its highest corner")
+    for name, rows in (("space.rotation", space.rotation), ("frame.rotation", metadata.frame.rotation)):
+        if not is_rigid(from_rotation(np.reshape(np.array(rows), (3, 3))), RIGID_TOLERANCE):
+            raise ValueError(f"{name} is no rotation")
+    for view in metadata.cameras:
+        if len(view.cam_from_object) != 16 or not is_rigid(view.pose, RIGID_TOLERANCE):
+            raise ValueError(f"the pose of {view.name!r} is no rigid transform")
+        _ = view.camera
+    return metadata
+
+
+def _numbers(value: object, name: str) -> Iterator[tuple[str, float]]:
+    """Each number with its place; those of a list have the list's."""
+    if isinstance(value, dict):
+        for key, part in value.items():
+            yield from _numbers(part, f"{name}.{key}" if name else str(key))
+    elif isinstance(value, list | tuple):
+        for part in value:
+            yield from _numbers(part, name)
+    elif isinstance(value, int | float) and not isinstance(value, bool):
+        yield name, value

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import msgspec
@@ -18,6 +17,7 @@ import numpy as np
 from fieldpose.errors import GeometryError
 from fieldpose.stages.geometry import Camera
 from fieldpose.stages.geometry.arrays import Points64
+from fieldpose.stages.structure.colmap_files import ModelImage
 from fieldpose.stages.structure.posed import PosedCameras
 from fieldpose.stages.structure.tracks import Tracks
 
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 PIXEL_CENTRE = 0.5
-_PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"}
 _ITERATIONS, _TOLERANCE = 50, 1e-6
 """Of one adjustment, among several: the cost changes by less than a millionth."""
 _ALIGNED_WITHIN_SIGMA = 10.0
@@ -183,32 +182,6 @@ def _matrix(cam_from_world: pycolmap.Rigid3d) -> np.ndarray:
     return np.concatenate([cam_from_world.matrix(), [[0.0, 0.0, 0.0, 1.0]]])
 
 
-@dataclass(frozen=True, eq=False)
-class ModelImage:
-    """An image of a COLMAP model: its name there, its camera, and its cam_from_world (4, 4)."""
-
-    name: str
-    camera: Camera
-    cam_from_world: np.ndarray
-
-
-def read_model(folder: Path) -> list[ModelImage]:
-    """The posed images of a model, binary or text, sorted by name. Raises GeometryError for what is no such model.
-
-    Lenses are those of OpenCV's perspective camera with up to five coefficients; others are refused by name.
-    """
-    import pycolmap
-
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
-    try:
-        scene = pycolmap.Reconstruction(folder)
-        posed = [(i.name, i.camera_id, _matrix(i.cam_from_world())) for i in scene.images.values() if i.has_pose]
-    except (RuntimeError, ValueError, IndexError, OSError) as error:
-        raise GeometryError(f"{folder}: no COLMAP model that can be read ({' '.join(str(error).split())})") from error
-    cameras = {camera_id: _perspective(folder, camera) for camera_id, camera in scene.cameras.items()}
-    return [ModelImage(name, cameras[camera], pose) for name, camera, pose in sorted(posed, key=lambda one: one[0])]
-
-
 def model_text(images: Sequence[ModelImage]) -> dict[str, str]:
     """The files of a model without points, name -> content, as COLMAP's text format has them; equal cameras are one.
 
@@ -232,19 +205,3 @@ def model_text(images: Sequence[ModelImage]) -> dict[str, str]:
         posed += [f"{number} {pose} {shared[image.camera]} {image.name}", ""]
     named = {"cameras.txt": cameras, "images.txt": posed, "points3D.txt": ["# points: 0"]}
     return {name: "\n".join(lines) + "\n" for name, lines in named.items()}
-
-
-def _perspective(folder: Path, camera: pycolmap.Camera) -> Camera:
-    name, params = camera.model.name, [float(p) for p in camera.params]
-    lens = [params[i] for i in camera.extra_params_idxs()]
-    if name not in _PERSPECTIVE or any(lens[5:]):
-        raise GeometryError(
-            f"{folder}: camera {camera.camera_id} is of COLMAP's model {name}, of which this has no equal; run COLMAP's"
-            " image_undistorter first, or map the images with the model OPENCV"
-        )
-    k1, k2, p1, p2, k3 = (lens + [0.0] * 5)[:5]
-    return Camera(
-        camera.width, camera.height, float(camera.focal_length_x), float(camera.focal_length_y),
-        float(camera.principal_point_x) - PIXEL_CENTRE, float(camera.principal_point_y) - PIXEL_CENTRE,
-        (k1, k2, p1, p2, k3),
-    )  # fmt: skip

@@ -109,7 +109,7 @@ def read_guess_file(path: Path) -> GuessFile:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise ConfigError(f"guess {str(path)!r}: no such file; or write train:NAME or perturb:10-40deg,0.2") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: no readable JSON file of guesses ({error})") from error
     if isinstance(content, dict) and "cam_from_object" in content:
         return GuessFile(start=_pose(path, content["cam_from_object"]))
@@ -127,7 +127,7 @@ def _frame_id(path: Path, text: str) -> int:
 def _pose(path: Path, rows: Any) -> np.ndarray:
     try:
         matrix = np.array(rows, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError, RecursionError):
         matrix = np.zeros(0)
     if not is_rigid(matrix, RIGID_TOLERANCE):
         raise ConfigError(f"{path}: a guess must be a 4x4 cam_from_object by rows: a rotation, a shift, then 0 0 0 1")

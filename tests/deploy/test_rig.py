@@ -19,7 +19,7 @@ from fieldpose.deploy.rig import planned_rig, read_rig
 from fieldpose.deploy.scene import demo_file
 from fieldpose.deploy.settings import changed
 from fieldpose.errors import ConfigError, FieldposeError, UsageError
-from fieldpose.stages.structure.colmap import read_model
+from fieldpose.stages.structure.colmap_files import read_model
 
 SEQUENCE = f"mcap:{demo_file('sequence.mcap')}"
 

@@ -20,7 +20,7 @@ from fieldpose.deploy.reporting.results import FrameResult
 from fieldpose.deploy.reporting.trajectories import PoseFiles, Trajectory, in_words, to_tum
 from fieldpose.errors import OutputError
 from fieldpose.stages.geometry import Camera, exp_se3, inverse
-from fieldpose.stages.structure.colmap import read_model
+from fieldpose.stages.structure.colmap_files import read_model
 
 ADDRESS = Address("test", "mug", "cam")
 BENT = Camera(640, 480, 520.25, 523.5, 325.0, 236.0, (-0.2, 0.08, 0.001, -0.0008, 0.01))

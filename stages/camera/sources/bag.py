@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from fieldpose.bus.messages import CameraOrigin, Encoding
-from fieldpose.errors import SourceError
+from fieldpose.errors import FieldposeError, SourceError
 from fieldpose.stages.camera.calibration import Calibration, Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
@@ -38,7 +37,6 @@ if TYPE_CHECKING:
 _KINDS = (".bag", ".mcap", ".db3")
 _STAMPED_WITHIN = 10
 _ZSTD = b"\x28\xb5\x2f\xfd"
-_DAMAGE = (OSError, ValueError, KeyError, IndexError, AssertionError, EOFError, struct.error)
 
 
 def open_bag(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
@@ -226,10 +224,7 @@ def _named(rest: str, config: CameraConfig, calibrator: Calibrator) -> _Bag:
 def _opened(path: Path) -> Iterator[AnyReader]:
     """A reader of the bag. SourceError where it cannot be opened or read, or rosbags is not installed."""
     try:
-        import apsw
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.rosbag1 import ReaderError as Ros1Error
-        from rosbags.rosbag2 import ReaderError as Ros2Error
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
         raise SourceError(f"{path}: rosbags, which reads bags, is missing; pip install 'fieldpose[ros]'") from error
@@ -237,7 +232,9 @@ def _opened(path: Path) -> Iterator[AnyReader]:
         # Bags of ROS 2 before Iron hold no definitions; a camera's messages are the same in all versions of ROS 2.
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             yield reader
-    except (AnyReaderError, Ros1Error, Ros2Error, apsw.Error, *_DAMAGE) as error:
+    except FieldposeError:
+        raise
+    except Exception as error:  # rosbags does not tell what damaged bytes raise
         detail = " ".join(str(error).split()) or type(error).__name__
         hint = "; recordings of fieldpose itself are read as mcap:FILE" if "Profile is not" in detail else ""
         raise SourceError(f"{path}: cannot be read as a bag ({detail}){hint}") from error

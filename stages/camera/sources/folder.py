@@ -7,14 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from fieldpose.errors import DatasetError, SourceError
 from fieldpose.stages.camera.calibration import Calibration, Calibrator
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Source
 from fieldpose.stages.images import shrunk_with_camera
-from fieldpose.stages.nerf.datasets.images import EXTENSIONS, is_image_name, orientation, probe
+from fieldpose.stages.nerf.datasets.images import EXTENSIONS, is_image_name, is_plain_jpeg, probe
 
 
 def open_folder(rest: str, config: CameraConfig, calibrator: Calibrator) -> Source:
@@ -58,7 +57,4 @@ def _read(frame_id: int, path: Path, config: CameraConfig, calibrator: Calibrato
 def _can_stay_encoded(path: Path, size: int | None) -> bool:
     """An RGB JPEG, small enough, that no decoder turns."""
     header = probe(path)
-    if orientation(path) != 1 or (size is not None and max(header.width, header.height) > size):
-        return False
-    with Image.open(path) as image:
-        return image.format == "JPEG" and image.mode == "RGB"
+    return is_plain_jpeg(path) and (size is None or max(header.width, header.height) <= size)

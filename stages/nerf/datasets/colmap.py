@@ -27,7 +27,7 @@ def model_of(root: Path) -> Path | None:
 
 def read_colmap(root: Path, model: Path, holdout: Holdout | None) -> Draft:
     """All images that have a pose; "auto" holds out every eighth. Raises DatasetError."""
-    from fieldpose.stages.structure.colmap import read_model
+    from fieldpose.stages.structure.colmap_files import read_model
 
     try:
         images = read_model(model)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,17 +13,22 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from fieldpose.errors import DatasetError
+from fieldpose.stages.geometry.cameras import LARGEST_SIDE
+from fieldpose.stages.images import MOST_PIXELS
 
 EXTENSIONS = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
 ORIENTATION = 0x0112
 """EXIF's number for it; from 5 on width and height change places."""
 _FIRST_ACROSS = 5
+_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "DIB", "TIFF", "PPM", "GIF")
+"""What Pillow may try: among its others are some that start programs."""
 _SIXTEEN_BITS = ("I", "I;16", "I;16B", "I;16L", "I;16N")
 Colour = tuple[int, int, int]
 WHITE: Colour = (255, 255, 255)
 PLAIN_WITHIN, PLAIN_SHARE, PLAIN_BORDER = 6, 0.95, 0.02
 """How far levels of a plain background may be from its colour (JPEG's noise), in which share of the pixels along an
 image's border, which is so wide, as a share of the image. The object may reach into a twentieth of it."""
+_BAND = 256
 _Result = TypeVar("_Result")
 
 
@@ -60,8 +66,8 @@ def load_depth(path: Path, width: int, height: int, scale: float) -> np.ndarray:
 
     Reads one-channel images (8, 16 or 32 bit) and .npy files; depths of neighbouring pixels are never mixed.
     """
-    stored = _load_array(path) if path.suffix == ".npy" else _read(path, np.array)
-    if stored.ndim != 2 or not np.issubdtype(stored.dtype, np.number):
+    stored = load_array(path) if path.suffix == ".npy" else _read(path, np.array)
+    if stored.ndim != 2 or stored.dtype.kind not in "biuf":
         raise DatasetError(f"{path}: expected one depth a pixel, got shape {stored.shape} of {stored.dtype}")
     return _resize_nearest(stored.astype(np.float32) * np.float32(scale), width, height)
 
@@ -79,12 +85,15 @@ def plain_background(load: Sequence[Callable[[], np.ndarray]]) -> Colour | None:
     """
     colour, shows_something = None, False
     for image in load:
-        pixels = image().astype(np.int16)
+        pixels = image()
+        border = _border(pixels).astype(np.int16)
         if colour is None:
-            colour = np.median(_border(pixels), axis=0)
-        if (np.abs(_border(pixels) - colour).max(axis=1) <= PLAIN_WITHIN).mean() < PLAIN_SHARE:
+            colour = np.median(border, axis=0)
+        if (np.abs(border - colour).max(axis=1) <= PLAIN_WITHIN).mean() < PLAIN_SHARE:
             return None
-        shows_something |= bool((np.abs(pixels - colour) > PLAIN_WITHIN).any())
+        shows_something = shows_something or any(
+            (np.abs(pixels[rows] - colour) > PLAIN_WITHIN).any() for rows in _bands(len(pixels))
+        )
     if colour is None or not shows_something:
         return None
     red, green, blue = (int(v) for v in np.rint(colour))
@@ -103,9 +112,17 @@ def over_background(rgba: np.ndarray, background: Colour | None) -> np.ndarray:
     """Lay (h, w, 4) uint8 over a colour (None: black); (h, w, 3) comes back as it is."""
     if rgba.shape[-1] == 3:
         return rgba
-    alpha = rgba[..., 3:].astype(np.float32) / 255
-    colour = rgba[..., :3] * alpha + np.array(background or (0, 0, 0), np.float32) * (1 - alpha)
-    return np.rint(colour).astype(np.uint8)
+    result = np.empty((*rgba.shape[:2], 3), np.uint8)
+    for rows in _bands(len(rgba)):
+        alpha = rgba[rows, :, 3:].astype(np.float32) / 255
+        colour = rgba[rows, :, :3] * alpha + np.array(background or (0, 0, 0), np.float32) * (1 - alpha)
+        result[rows] = np.rint(colour).astype(np.uint8)
+    return result
+
+
+def _bands(height: int) -> list[slice]:
+    """Rows of an image, so many at once that numbers larger than its bytes take little memory."""
+    return [slice(first, first + _BAND) for first in range(0, height, _BAND)]
 
 
 def upright(path: Path) -> np.ndarray:
@@ -146,13 +163,21 @@ def upright_size(path: Path) -> tuple[int, int]:
     return _read(path, size)
 
 
+def is_plain_jpeg(path: Path) -> bool:
+    """Whether an image file is a JPEG of three colours that its EXIF does not turn. Raises DatasetError."""
+    return _read(path, lambda image: image.format == "JPEG" and image.mode == "RGB") and orientation(path) == 1
+
+
 def _read(path: Path, use: Callable[[Image.Image], _Result]) -> _Result:
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=_FORMATS) as image:
+            if max(image.size) > LARGEST_SIDE or image.width * image.height > MOST_PIXELS:
+                size = f"{image.width}x{image.height} pixels where {LARGEST_SIDE} a side and {MOST_PIXELS}"
+                raise ValueError(f"{size} are the most")
             return use(image)
     except FileNotFoundError as error:
         raise DatasetError(f"{path}: no such image; restore the file, or name another") from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except Exception as error:  # Pillow does not tell what its decoders raise
         reason = "not an image" if isinstance(error, Image.UnidentifiedImageError) else error
         raise DatasetError(f"{path}: cannot be read ({reason}); restore the file, or leave it out") from error
 
@@ -162,13 +187,24 @@ def _colours(image: Image.Image, alpha: bool) -> np.ndarray:
     if image.mode in _SIXTEEN_BITS:
         levels = np.clip(np.asarray(image).astype(np.float32), 0, 65535) / 257
         image = Image.fromarray(np.rint(levels).astype(np.uint8))
-    return np.array(image.convert("RGBA" if alpha else "RGB"))
+    wanted = "RGBA" if alpha else "RGB"
+    return np.array(image if image.mode == wanted else image.convert(wanted))
 
 
-def _load_array(path: Path) -> np.ndarray:
+def load_array(path: Path) -> np.ndarray:
+    """The numbers of a .npy file, whose shape is believed where the file has as many bytes. Raises DatasetError."""
     try:
+        with path.open("rb") as file:
+            version = np.lib.format.read_magic(file)
+            read_header = (
+                np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            )
+            shape, _, dtype = read_header(file)
+            there, stated = path.stat().st_size - file.tell(), math.prod(shape) * dtype.itemsize
+            if dtype.kind not in "biufc" or min(shape, default=0) < 0 or stated != there:
+                raise ValueError(f"{there} bytes where {dtype} of shape {shape} is stated")
         return np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # numpy reads the header as Python, and raises what its parser does
         raise DatasetError(f"{path}: not a readable .npy file ({error}); export it again") from error
 
 
@@ -187,12 +223,17 @@ def resized_rgba(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
     """(height, width, 4) uint8: colours are averaged weighted by alpha, so that none from behind bleed into edges."""
     if pixels.shape[:2] == (height, width):
         return pixels
-    weighted = pixels.astype(np.float32)
-    weighted[..., :3] *= weighted[..., 3:] / 255
-    resized = _resize(weighted, width, height)
-    alpha = resized[..., 3:]
-    colour = np.divide(resized[..., :3] * 255, alpha, out=np.zeros_like(resized[..., :3]), where=alpha > 0)
-    return np.rint(np.clip(np.concatenate([colour, alpha], axis=2), 0, 255)).astype(np.uint8)
+    # A channel at a time: as floats all of a large image's take four times its memory.
+    weight = pixels[..., 3].astype(np.float32)
+    alpha = _resize(weight, width, height)
+    weight /= 255
+    result = np.empty((height, width, 4), np.uint8)
+    result[..., 3] = np.rint(np.clip(alpha, 0, 255))
+    for channel in range(3):
+        resized = _resize(pixels[..., channel] * weight, width, height)
+        colour = np.divide(resized * 255, alpha, out=np.zeros_like(resized), where=alpha > 0)
+        result[..., channel] = np.rint(np.clip(colour, 0, 255))
+    return result
 
 
 def _resize_nearest(values: np.ndarray, width: int, height: int) -> np.ndarray:

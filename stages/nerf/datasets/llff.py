@@ -13,12 +13,14 @@ from fieldpose.stages.geometry.cameras import Camera
 from fieldpose.stages.geometry.rigid import from_rotation, inverse
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
 from fieldpose.stages.nerf.datasets.frames import OPENCV_FROM_OPENGL, relative_name
-from fieldpose.stages.nerf.datasets.images import is_image_name, probe
+from fieldpose.stages.nerf.datasets.images import is_image_name, load_array, probe
 from fieldpose.stages.nerf.datasets.parsing import checked_rigid
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 FILE = "poses_bounds.npy"
 BOUND_FACTOR = 0.75
+_NEAREST = 1e-15
+"""Of depths, in whatever unit: what is nearer, or as much farther, is none."""
 _ASPECT_TOLERANCE = 0.02
 
 
@@ -54,12 +56,9 @@ def read_llff(root: Path, holdout: Holdout | None, normalise: bool, downscale: i
 
 def read_poses_bounds(file: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """object_from_cam (n, 4, 4) in OpenCV axes, (height, width, focal length) (n, 3), (near, far) (n, 2)."""
-    try:
-        table = np.load(file, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise DatasetError(f"{file}: not a readable .npy file ({error}); export it again") from error
-    if not isinstance(table, np.ndarray) or table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fi":
-        found = f"{table.dtype} of shape {table.shape}" if isinstance(table, np.ndarray) else "an archive"
+    table = load_array(file)
+    if table.ndim != 2 or table.shape[1] != 17 or table.dtype.kind not in "fi":
+        found = f"{table.dtype} of shape {table.shape}"
         raise DatasetError(f"{file}: expected 17 numbers an image, got {found}; export it again")
     if len(table) == 0:
         raise DatasetError(f"{file}: it has no poses; export it again")
@@ -86,7 +85,8 @@ def recentred(object_from_cam: np.ndarray, scale: float) -> np.ndarray:
 
 def _check_numbers(file: Path, hwf: np.ndarray, depths: np.ndarray) -> None:
     bad_camera = ~(np.isfinite(hwf).all(axis=1) & (hwf > 0).all(axis=1))
-    bad_depths = ~(np.isfinite(depths).all(axis=1) & (depths[:, 0] > 0) & (depths[:, 0] < depths[:, 1]))
+    near, far = depths.T
+    bad_depths = ~((near >= _NEAREST) & (near < far) & (far <= 1 / _NEAREST))
     if bad_camera.any():
         i = int(np.argmax(bad_camera))
         raise DatasetError(f"{file}: image {i}: height, width and focal length must be positive, got {hwf[i].tolist()}")

@@ -40,7 +40,8 @@ def _leave_out_deleted(file: Path, document: Document) -> tuple[str, ...]:
         return ()
     if len(deleted) == total:
         raise DatasetError(f"{file}: none of its {total} images is there (the first is {deleted[0]}); restore them")
-    document.frames = [frame for frame in document.frames if frame.file_path not in set(deleted)]
+    gone = set(deleted)
+    document.frames = [frame for frame in document.frames if frame.file_path not in gone]
     return (f"{file.name}: {len(deleted)} of {total} frames have no image and are left out: {', '.join(deleted)}",)
 
 

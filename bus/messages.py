@@ -70,7 +70,10 @@ Changes = Literal["reset", "set_guess", "set_solving", "take_keyframe"]
 
 
 class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`sequence` counts from 0 per (source, topic), so that a receiver sees what it missed."""
+    """`sequence` counts from 0 per (source, topic), so that a receiver sees what it missed.
+
+    instance: drawn by each sender when it begins, so that one is told from another of its name; 0 where none was.
+    """
 
     source: str
     sequence: int
@@ -78,9 +81,10 @@ class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pass_index: int
     capture_ns: int
     sent_ns: int
+    instance: int = 0
 
     def __post_init__(self) -> None:
-        numbers = (self.sequence, self.frame_id, self.pass_index, self.capture_ns, self.sent_ns)
+        numbers = (self.sequence, self.frame_id, self.pass_index, self.capture_ns, self.sent_ns, self.instance)
         if not all(0 <= number < 2**63 for number in numbers):
             raise ValueError("header: numbers must be from 0 to 2^63 - 1")
         if len(self.source) > 128:

@@ -122,6 +122,7 @@ class _Node:
         self._desk = Desk()
         self._served: Closing | None = None
         self._token: Closing | None = None
+        self._announced: Closing | None = None
         self._closed = False
         self._throttle = Throttle(stage_logger(handler.name))
         self._failed = 0
@@ -145,6 +146,7 @@ class _Node:
         return self._inbox is not None and self._inbox.has_some
 
     def start(self, stop: threading.Event) -> None:
+        self._announced = self._outbox.announce()
         self._send_stats(ready=False)
         if not stop.is_set():
             self._handler.start()
@@ -187,6 +189,8 @@ class _Node:
                 listening.close()
         self._handler.stop()
         self._send_stats(ready=False)
+        if self._announced is not None:
+            self._announced.close()
 
     def _answer(self, payload: bytes) -> bytes:
         """Called from threads of the bus."""
@@ -258,7 +262,10 @@ class _Node:
 
     def _send_stats(self, ready: bool) -> None:
         self._next_stats = time.monotonic() + self._stats_period_s
-        self._outbox.publish(STATS, self._stats(ready))
+        try:
+            self._outbox.publish(STATS, self._stats(ready))
+        except CodecError as error:
+            self._note_failure(error)
 
     def _stats(self, ready: bool) -> Stats:
         counts = self._inbox.counts if self._inbox is not None else InboxCounts()

@@ -17,6 +17,7 @@ from contextlib import suppress
 from typing import Annotated
 
 import msgspec
+from cachetools import LRUCache
 
 from fieldpose.bus.protocol import SETTLE_S, Closer, Closing, Watcher
 from fieldpose.bus.topics import key_matches
@@ -27,6 +28,10 @@ _PAUSES_S = (0.02, 0.32)
 # More than the size from which a message goes through shared memory, which takes a while to set up the first time.
 _IMAGE_BYTES = 8192
 MAX_BYTES = 64 << 10
+_MOST_HELD = 256
+_ANSWERS_PER_S = 50.0
+"""To greetings under one name, which are repeated until they are answered, and under all that are kept in mind."""
+_ANSWERED_KEPT = 256
 
 
 class _Word(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -35,7 +40,7 @@ class _Word(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     changes: how often what it holds has changed, for words may overtake each other.
     """
 
-    held: Annotated[tuple[_Key, ...], msgspec.Meta(max_length=64)]
+    held: Annotated[tuple[_Key, ...], msgspec.Meta(max_length=_MOST_HELD)]
     changes: Annotated[int, msgspec.Meta(ge=0)]
     number: int = 0
     to: str = ""
@@ -53,6 +58,7 @@ class Presence:
         self._theirs: dict[str, _Word] = {}
         self._answers: dict[str, int] = {}
         self._seen: set[str] = set()
+        self._answered_s: LRUCache[str, tuple[float, float]] = LRUCache(_ANSWERED_KEPT)
         self._watchers: list[tuple[str, Watcher]] = []
         self._number = 0
         self._greet_again = self._closed = False
@@ -142,7 +148,7 @@ class Presence:
                     self._answers[peer] = max(self._answers[peer], word.number)
                 self._tell()
                 self._changed.notify_all()
-        if word.number > 0 and not word.to:
+        if word.number > 0 and not word.to and self._may_answer(peer):
             with suppress(TransportError):
                 self._send(self._word(word.number, peer))
 
@@ -153,6 +159,18 @@ class Presence:
             self._changed.notify_all()
         if greeter is not None:
             greeter.join()
+
+    def _may_answer(self, peer: str) -> bool:
+        """A bucket for each name, from which an answer takes one and which time fills; and one for all names."""
+        now = time.monotonic()
+        with self._changed:
+            for name, per_s in ((peer, _ANSWERS_PER_S), ("", 10 * _ANSWERS_PER_S)):
+                left, at = self._answered_s.get(name, (per_s, now))
+                left = min(per_s, left + per_s * (now - at))
+                self._answered_s[name] = (left - (left >= 1), now)
+                if left < 1:
+                    return False
+        return True
 
     def _answered(self, number: int) -> bool:
         return min(self._answers.values(), default=number) >= number

@@ -16,8 +16,14 @@ from fieldpose.bus.messages import Header, Message
 from fieldpose.bus.open_recording import OpenRecording, set_aside
 from fieldpose.bus.ports import Sequences
 from fieldpose.bus.replay import RECORDING_RECORD, SOURCE_RECORD, Attachment, Salvage
+from fieldpose.bus.senders import KEPT
 from fieldpose.bus.topics import Topic, topic_of
 from fieldpose.errors import CodecError, RecordingError
+
+_MOST_KEYS = 4096
+"""More than all topics of a hundred pipelines; MCAP has numbers for 65535."""
+_OTHERS = "(others)"
+"""Counts together the senders beyond those of which each is counted."""
 
 Metadata = Mapping[str, Mapping[str, str]]
 
@@ -95,6 +101,9 @@ class RecordingWriter(OpenRecording):
         except CodecError:
             self.refused += 1
             return
+        if key not in self._channels and len(self._channels) >= _MOST_KEYS:
+            self.refused += 1
+            return
         self._put(key, topic, payload, header, log_time_ns)
 
     def copy(self, salvage: Salvage) -> int:
@@ -124,7 +133,10 @@ class RecordingWriter(OpenRecording):
 
     def _count(self, key: str, header: Header) -> _Tally:
         missing = self._sequences.seen(key, header)
-        tally = self._tallies.setdefault((key, header.source), _Tally(header.sequence))
+        sender = (key, header.source)
+        if sender not in self._tallies and len(self._tallies) >= KEPT:
+            sender = (key, _OTHERS)
+        tally = self._tallies.setdefault(sender, _Tally(header.sequence))
         tally.missing += missing
         tally.last = header.sequence
         return tally

@@ -47,6 +47,11 @@ class Address:
         _check_part("stage", stage)
         return f"{self.site}/live/{self.object}/{self.camera}/{stage}"
 
+    def sender(self, stage: str, instance: int | None = None) -> str:
+        """The key of the token by which the sender `stage` of that instance tells that it is there; None: of any."""
+        _check_part("stage", stage)
+        return f"{self.site}/sender/{self.object}/{self.camera}/{stage}/{'*' if instance is None else instance}"
+
     def control(self, stage: str) -> str:
         """The key under which `stage` answers requests while it is ready, where it takes any."""
         _check_part("stage", stage)
@@ -82,7 +87,8 @@ class Topic(Generic[M]):
 
     `capacity` bounds a receiver's queue, in messages: the oldest is dropped for a newer one, so 1 is newest-only.
     A stage that joins several inputs keeps `JOIN_CAPACITY` of a newest-only topic instead. `of_frame`: there is one a
-    frame, whatever pass over it is asked for.
+    frame, whatever pass over it is asked for. `writers`: the stages that send it, where they run; others may, of which
+    STATS has its writer in its key.
     """
 
     name: str
@@ -93,6 +99,7 @@ class Topic(Generic[M]):
     priority: Literal["data", "data_low"] = "data"
     recorded: bool = True
     of_frame: bool = False
+    writers: tuple[str, ...] = ()
 
     @property
     def newest_only(self) -> bool:
@@ -109,29 +116,46 @@ _GROUPS = {name: f"(?P<{name}>{_PART_OF_KEY})" for name in ("site", "object", "c
 JOIN_CAPACITY = 64
 
 _PIPELINE = "{site}/track/{object}/{camera}/"
+_SOLVING = ("retrieval", "rendering", "matching", "lifting", "pnp", "refinement")
 _IMAGE_BYTES, _SMALL = 80 << 20, 64 << 10
 
 FRAME = Topic(
-    "frame", "{site}/camera/{camera}/frame", messages.Frame, capacity=1, max_bytes=_IMAGE_BYTES, priority="data_low",
-    of_frame=True,
+    "frame", "{site}/camera/{camera}/frame", messages.Frame, writers=("camera",), capacity=1, max_bytes=_IMAGE_BYTES,
+    priority="data_low", of_frame=True,
 )  # fmt: skip
 CAMERA_INFO = Topic(
-    "camera_info", "{site}/camera/{camera}/info", messages.CameraInfo, capacity=1, max_bytes=_SMALL, of_frame=True
+    "camera_info",
+    "{site}/camera/{camera}/info",
+    messages.CameraInfo,
+    writers=("camera",),
+    capacity=1,
+    max_bytes=_SMALL,
+    of_frame=True,
 )
-TRUTH = Topic("truth", _PIPELINE + "truth", messages.Truth, max_bytes=_SMALL, of_frame=True)
-PRIOR = Topic("prior", _PIPELINE + "prior", messages.Prior, max_bytes=_SMALL, of_frame=True)
-SEARCH = Topic("search", _PIPELINE + "search", messages.Search, max_bytes=_SMALL)
-RETRIEVED = Topic("retrieved", _PIPELINE + "retrieved", messages.Retrieved, max_bytes=_SMALL)
-GUESS = Topic("guess", _PIPELINE + "guess", messages.Guess, max_bytes=_SMALL)
-VIEW = Topic("view", _PIPELINE + "view", messages.View, capacity=16, max_bytes=_IMAGE_BYTES, priority="data_low")
-MATCHES = Topic("matches", _PIPELINE + "matches", messages.Matches)
-CORRESPONDENCES = Topic("correspondences", _PIPELINE + "correspondences", messages.Correspondences)
-ESTIMATE = Topic("estimate", _PIPELINE + "estimate", messages.Estimate)
-POSE = Topic("pose", _PIPELINE + "pose", messages.Pose, max_bytes=_SMALL)
-FAILURE = Topic("failure", _PIPELINE + "failure", messages.Failure, max_bytes=_SMALL)
-FOLLOWED = Topic("followed", _PIPELINE + "followed", messages.Followed, max_bytes=_SMALL)
-STATE = Topic("state", _PIPELINE + "state", messages.State, max_bytes=_SMALL)
-CONTROL = Topic("control", _PIPELINE + "control", messages.Control, max_bytes=_SMALL)
+TRUTH = Topic("truth", _PIPELINE + "truth", messages.Truth, writers=("camera",), max_bytes=_SMALL, of_frame=True)
+PRIOR = Topic("prior", _PIPELINE + "prior", messages.Prior, writers=("perturbation",), max_bytes=_SMALL, of_frame=True)
+SEARCH = Topic("search", _PIPELINE + "search", messages.Search, writers=("tracking",), max_bytes=_SMALL)
+RETRIEVED = Topic("retrieved", _PIPELINE + "retrieved", messages.Retrieved, writers=("retrieval",), max_bytes=_SMALL)
+GUESS = Topic("guess", _PIPELINE + "guess", messages.Guess, writers=("tracking",), max_bytes=_SMALL)
+VIEW = Topic(
+    "view",
+    _PIPELINE + "view",
+    messages.View,
+    writers=("rendering",),
+    capacity=16,
+    max_bytes=_IMAGE_BYTES,
+    priority="data_low",
+)
+MATCHES = Topic("matches", _PIPELINE + "matches", messages.Matches, writers=("matching",))
+CORRESPONDENCES = Topic(
+    "correspondences", _PIPELINE + "correspondences", messages.Correspondences, writers=("lifting",)
+)
+ESTIMATE = Topic("estimate", _PIPELINE + "estimate", messages.Estimate, writers=("pnp",))
+POSE = Topic("pose", _PIPELINE + "pose", messages.Pose, writers=("refinement",), max_bytes=_SMALL)
+FAILURE = Topic("failure", _PIPELINE + "failure", messages.Failure, writers=_SOLVING, max_bytes=_SMALL)
+FOLLOWED = Topic("followed", _PIPELINE + "followed", messages.Followed, writers=("tracking",), max_bytes=_SMALL)
+STATE = Topic("state", _PIPELINE + "state", messages.State, writers=("tracking",), max_bytes=_SMALL)
+CONTROL = Topic("control", _PIPELINE + "control", messages.Control, writers=("tracking",), max_bytes=_SMALL)
 STATS = Topic("stats", "{site}/stats/{object}/{camera}/{stage}", messages.Stats, capacity=256, max_bytes=16 << 10)
 
 ALL: tuple[Topic[Any], ...] = (

@@ -14,7 +14,7 @@ from fieldpose.bus.messages import CameraOrigin, Encoding, Prior, State
 from fieldpose.bus.ports import Inbox, Outbox, first_header
 from fieldpose.bus.requests import ControlValues, Request, Reset, SetGuess, SetSolving, Show, TakeKeyframe
 from fieldpose.bus.topics import PRIOR, STATE, Address
-from fieldpose.bus.transport import LOCAL_HUB
+from fieldpose.bus.transport import LOCAL_HUB, Closing
 from fieldpose.deploy.access.joining import NO_ENTRY, Entry, join
 from fieldpose.deploy.access.roles import PROGRAM
 from fieldpose.errors import ConfigError, GeometryError
@@ -43,6 +43,7 @@ class Connection:
             self._bus.close()
             raise
         self._outbox = Outbox(self._bus, address, "camera")
+        self._announced: Closing | None = None
         self._frames = 0
 
     def states(self, timeout_s: float | None = None) -> Iterator[State]:
@@ -67,6 +68,8 @@ class Connection:
         """
         if encoding == "rgb8":
             checked_image(image)
+        if self._announced is None:
+            self._announced = self._outbox.announce()
         frame_id = self._frames if frame_id is None else frame_id
         self._frames = frame_id + 1
         header = first_header(frame_id, time.time_ns() if capture_ns is None else capture_ns)

@@ -88,6 +88,7 @@ class RosBridge:
             self._subscribe(names.resolved(topics.camera_info or info_topic(image)), INFO, self._on_info, _INFOS)
             kind = COMPRESSED if image.endswith("/compressed") else IMAGE
             self._subscribe(image, kind, self._on_image, 1)
+            self._frames.announce()  # until the bus is closed
 
     def run(self, stop: threading.Event) -> None:
         """Carry messages until `stop`."""

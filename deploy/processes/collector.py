@@ -6,10 +6,13 @@ from collections import Counter, deque
 from functools import partial
 from typing import Any
 
+from cachetools import LRUCache
+
 from fieldpose.bus.codec import decode_header
 from fieldpose.bus.messages import Header, Message, State, Stats
 from fieldpose.bus.ports import Inbox, Sequences
 from fieldpose.bus.protocol import Bus
+from fieldpose.bus.senders import Senders
 from fieldpose.bus.topics import CAMERA_INFO, FRAME, STATE, STATS, TRUTH, Address, Topic
 from fieldpose.deploy.reporting.gathering import TIMED, Gathering
 from fieldpose.deploy.reporting.results import FrameResult
@@ -18,6 +21,8 @@ from fieldpose.stages.geometry import Similarity
 
 _READ = (STATE, TRUTH, STATS, CAMERA_INFO)
 _CAPACITY = 4096
+_STAGES_KEPT = 256
+_HEADERS_KEPT = 1 << 16
 _RATE_WINDOW_NS = 3_000_000_000
 
 
@@ -28,14 +33,15 @@ class Collector:
     """
 
     def __init__(self, bus: Bus, address: Address, object_from_dataset: Similarity | None = None) -> None:
-        self.stats: dict[str, Stats] = {}
+        self.stats: LRUCache[str, Stats] = LRUCache(_STAGES_KEPT)
         self.newest_state: State | None = None
         self.observed: Counter[str] = Counter()
         self.sent = 0
         self._numbers = Sequences(from_start=True)
         self._gathering = Gathering(object_from_dataset)
-        self._headers: deque[tuple[Topic[Any], Header]] = deque()
-        self._reported_ns: deque[int] = deque()
+        self._senders = Senders(bus, address.site)
+        self._headers: deque[tuple[Topic[Any], Header]] = deque(maxlen=_HEADERS_KEPT)
+        self._reported_ns: deque[int] = deque(maxlen=_HEADERS_KEPT)
         self._inbox = Inbox(bus, address, _READ, dict.fromkeys(_READ, _CAPACITY))
         self._subscriptions = [
             bus.subscribe(address.key(topic), partial(self._timed, topic), _CAPACITY) for topic in TIMED
@@ -45,6 +51,7 @@ class Collector:
         for subscription in self._subscriptions:
             subscription.close()
         self._inbox.close()
+        self._senders.close()
 
     def update(self) -> None:
         """Take in what has come since the last time."""
@@ -52,7 +59,8 @@ class Collector:
             self._gathering.note_header(*self._headers.popleft())
         for received in self._inbox.drain():
             self.observed[received.key] += 1
-            self._note(received.message)
+            if not isinstance(received.message, Stats) or received.key.endswith(f"/{received.message.stage}"):
+                self._note(received.message)
 
     def results(self) -> list[FrameResult]:
         """What became of each frame that the camera has sent, oldest first."""
@@ -69,6 +77,8 @@ class Collector:
             header = decode_header(payload)
         except CodecError:
             return  # the stages refuse and count it
+        if self._senders.doubt(topic, key, header) is not None:
+            return
         self.observed[key] += 1
         if topic is FRAME:
             # By the camera's own numbers: where this process is kept from running, it may miss some.

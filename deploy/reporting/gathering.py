@@ -22,6 +22,8 @@ from fieldpose.stages.geometry import Camera, Similarity
 TIMED = (FRAME, *BETWEEN_STAGES)
 """Topics of which headers are enough: when something was sent, and by whom."""
 FRAMES_KEPT = 100_000
+_MOST_SENT = 1024
+"""Of one frame: more than any that is searched for in all its passes."""
 
 
 @dataclass
@@ -56,7 +58,8 @@ class Gathering:
         if topic is FRAME:
             seen.camera_sent_ns = header.sent_ns
         else:
-            seen.sent.append((header.sent_ns, header.source))
+            if len(seen.sent) < _MOST_SENT:
+                seen.sent.append((header.sent_ns, header.source))
             seen.passes += topic is GUESS
 
     def note(self, message: Message) -> None:

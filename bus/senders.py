@@ -51,7 +51,8 @@ class Senders:
 
     def __init__(self, bus: Bus, site: str) -> None:
         self._lock = threading.Lock()
-        self._announced: set[tuple[str, int]] = set()
+        self._announced: dict[tuple[str, str, str], set[int]] = {}
+        self._places: LRUCache[str, tuple[str, str] | None] = LRUCache(KEPT)
         self._bound: LRUCache[tuple[str, str], int] = LRUCache(KEPT)
         self._strict: LRUCache[str, bool] = LRUCache(KEPT)
         self._numbers = Numbers()
@@ -69,21 +70,39 @@ class Senders:
         self._watching.close()
 
     def _doubt(self, topic: Topic[Any], key: str, header: Header) -> str | None:
+        place = self._place(topic, key)
+        if place is None:
+            return "under a key that is none"
         name, instance = header.source, header.instance
         writers = (key.rpartition("/")[2],) if topic is STATS else topic.writers
+        known = {writer: self._announced.get((*place, writer), set()) for writer in writers}
+        if any(known.values()):
+            self._strict[key] = True
         bound = self._bound.get((key, name))
-        if name in writers and (name, instance) in self._announced:
-            if bound is not None and bound != instance and (name, bound) in self._announced:
+        if instance in known.get(name, ()):
+            if bound is not None and bound != instance and bound in known[name]:
                 return "a second sender under one name"
             self._bound[key, name] = instance
-            self._strict[key] = True
             return None
         if self._strict.get(key, False) and (bound is None or bound != instance):
             return "not by who writes it here"
         return None
 
+    def _place(self, topic: Topic[Any], key: str) -> tuple[str, str] | None:
+        """Object and camera of a key; "*" where its topic is of a camera for all objects."""
+        if key not in self._places:
+            address = topic.address_of(key)
+            object = "*" if "{object}" not in topic.template or address is None else address.object
+            self._places[key] = None if address is None else (object, address.camera)
+        return self._places[key]
+
     def _heard(self, token: str, alive: bool) -> None:
-        *_, name, number = token.split("/")
-        if number.isdecimal():
-            with self._lock:
-                (self._announced.add if alive else self._announced.discard)((name, int(number[:18])))
+        *_, object, camera, name, number = token.split("/")
+        if not number.isdecimal():
+            return
+        with self._lock:
+            for place in ((object, camera, name), ("*", camera, name)):
+                instances = self._announced.setdefault(place, set())
+                (instances.add if alive else instances.discard)(int(number[:18]))
+                if not instances:
+                    del self._announced[place]

@@ -76,3 +76,8 @@ def test_the_picture_shows_every_edge_as_it_is() -> None:
     assert edges == set(picture["edges"]())
     for topic in {topic for _, _, topic in edges}:
         assert f">{topic}</text>" in drawn
+
+
+def test_topics_name_their_writers_as_the_graph_has_them() -> None:
+    for topic in ALL:
+        assert set(topic.writers) == {row.name for row in GRAPH if topic in row.writes}

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
-import msgspec
 import numpy as np
 
 from fieldpose.errors import DatasetError
@@ -77,8 +76,8 @@ def check_keys(file: Path, where: str, content: Mapping[str, object], known: typ
 
     Other keys, which other programs write for themselves, are theirs.
     """
-    names = {field.name for field in msgspec.structs.fields(known)}
-    matter = sorted(names & {*(field.name for field in msgspec.structs.fields(Intrinsics)), *_MATTER})
+    names = set(known.__struct_fields__)
+    matter = sorted(names & {*Intrinsics.__struct_fields__, *_MATTER})
     for key in sorted(content.keys() - names - NOT_OURS):
         if key.endswith(_OF_OTHERS) or key.startswith("n_"):
             continue
@@ -90,7 +89,11 @@ def check_keys(file: Path, where: str, content: Mapping[str, object], known: typ
             raise DatasetError(f"{file}: {where}{key} is {content[key]!r}, which is not supported; {UNSUPPORTED[key]}")
 
 
-def find_image(root: Path, file_path: str) -> Path | None:
+Listings = dict[Path, dict[str, Path]]
+"""What stands in folders, by names in lower case: for who looks for many images that may not be there."""
+
+
+def find_image(root: Path, file_path: str, listings: Listings | None = None) -> Path | None:
     """The image that a frame names; None if there is none.
 
     Its extension may be left out, or differ in upper and lower case, and the path may begin in another folder than the
@@ -99,7 +102,7 @@ def find_image(root: Path, file_path: str) -> Path | None:
     parts = PurePosixPath(file_path.replace("\\", "/")).parts
     for first in range(len(parts)):
         try:
-            found = _image_at(root.joinpath(*parts[first:]))
+            found = _image_at(root.joinpath(*parts[first:]), {} if listings is None else listings)
         except (OSError, ValueError):  # no name that a file can have, as one that is empty or too long
             continue
         if found is not None:
@@ -107,12 +110,15 @@ def find_image(root: Path, file_path: str) -> Path | None:
     return None
 
 
-def _image_at(path: Path) -> Path | None:
+def _image_at(path: Path, listings: Listings) -> Path | None:
     candidates = (path, *(path.with_name(path.name + extension) for extension in EXTENSIONS))
     found = next((candidate for candidate in candidates if candidate.is_file()), None)
-    if found is None and path.parent.is_dir():
-        wanted = {candidate.name.lower() for candidate in candidates}
-        found = next((p for p in sorted(path.parent.iterdir()) if p.name.lower() in wanted and p.is_file()), None)
+    if found is None and path.parent not in listings:
+        there = sorted(path.parent.iterdir(), reverse=True) if path.parent.is_dir() else []
+        listings[path.parent] = {p.name.lower(): p for p in there}
+    if found is None:
+        alike = (listings[path.parent].get(candidate.name.lower()) for candidate in candidates)
+        found = min((p for p in alike if p is not None and p.is_file()), default=None)
     return found
 
 
@@ -123,24 +129,29 @@ def read_records(
 
     DatasetError if an image is missing or has another size than stated, or a pose is not rigid.
     """
-    found = [_found(file, frame) for frame in document.frames]
+    listings: Listings = {}
+    found = [_found(file, frame, listings) for frame in document.frames]
+    _check_names(file, [relative_name(file.parent, path) for path in found])
     headers = [probe(path) for path in found]
     _check_sizes(file, document, found, headers)
     records = [
         _record(file, document, frame, path, header, split, pixel_centre)
         for frame, path, header in zip(document.frames, found, headers, strict=True)
     ]
-    check_distinct(file, records)
     return records
 
 
 def check_distinct(file: Path | str, records: Sequence[ImageRecord]) -> None:
     """DatasetError if one image is listed twice."""
+    _check_names(file, [record.name for record in records])
+
+
+def _check_names(file: Path | str, names: Sequence[str]) -> None:
     seen: set[str] = set()
-    for record in records:
-        if record.name in seen:
-            raise DatasetError(f"{file}: {record.name} is listed twice; take one of its frames out")
-        seen.add(record.name)
+    for name in names:
+        if name in seen:
+            raise DatasetError(f"{file}: {name} is listed twice; take one of its frames out")
+        seen.add(name)
 
 
 def relative_name(root: Path, path: Path) -> str:
@@ -159,8 +170,8 @@ def _check_document(file: Path, document: Document) -> None:
             raise DatasetError(f"{file}: {name} must be positive, got {number}")
 
 
-def _found(file: Path, frame: Frame) -> Path:
-    path = find_image(file.parent, frame.file_path)
+def _found(file: Path, frame: Frame, listings: Listings) -> Path:
+    path = find_image(file.parent, frame.file_path, listings)
     if path is None:
         raise DatasetError(
             f"{file.parent / frame.file_path}: no such image, but {file.name} lists it;"

@@ -8,7 +8,7 @@ from typing import Literal
 
 from fieldpose.errors import DatasetError
 from fieldpose.stages.nerf.datasets.assemble import Draft, Holdout, split_of
-from fieldpose.stages.nerf.datasets.frames import Document, Frame, find_image, read_document, read_records
+from fieldpose.stages.nerf.datasets.frames import Document, Frame, Listings, find_image, read_document, read_records
 from fieldpose.stages.nerf.datasets.records import ImageRecord
 
 FILE = "transforms.json"
@@ -31,8 +31,10 @@ def read_transforms(root: Path, holdout: Holdout | None) -> Draft:
 
 
 def _leave_out_deleted(file: Path, document: Document) -> tuple[str, ...]:
+    listings: Listings = {}
+
     def is_deleted(frame: Frame) -> bool:
-        return frame.sharpness is not None and find_image(file.parent, frame.file_path) is None
+        return frame.sharpness is not None and find_image(file.parent, frame.file_path, listings) is None
 
     total = len(document.frames)
     deleted = [frame.file_path for frame in document.frames if is_deleted(frame)]

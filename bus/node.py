@@ -65,10 +65,11 @@ def run_nodes(
     arrived = threading.Condition()
     nodes = [_Node(handler, bus, address, arrived, stats_period_s) for handler, address in handlers]
     with StopSignals(stop) as signals, ExitStack() as closing:
-        # Settled first, for a recorder that runs already is to get this process's very first message.
-        bus.settle(SETTLE_S)
         for node in nodes:
             closing.callback(node.close)
+            node.announce()
+        # Settled first, for a recorder that runs already is to get this process's very first message, and to know it.
+        bus.settle(SETTLE_S)
         # The last to be called back, and so the first: what is closed is not to be interrupted.
         closing.callback(setattr, signals, "interrupting", False)
         with suppress(Interrupted, EndOfInput):
@@ -145,8 +146,11 @@ class _Node:
         """Whether a message waits for it."""
         return self._inbox is not None and self._inbox.has_some
 
-    def start(self, stop: threading.Event) -> None:
+    def announce(self) -> None:
+        """Tell who sends from here."""
         self._announced = self._outbox.announce()
+
+    def start(self, stop: threading.Event) -> None:
         self._send_stats(ready=False)
         if not stop.is_set():
             self._handler.start()

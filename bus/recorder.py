@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from fieldpose.bus.codec import decode_header, encode
@@ -13,6 +12,7 @@ from fieldpose.bus.node import Output
 from fieldpose.bus.protocol import Bus, Closing, Sink
 from fieldpose.bus.requests import SaveSnapshot, decode_request
 from fieldpose.bus.ring import Snapshots
+from fieldpose.bus.senders import Senders
 from fieldpose.bus.topics import ALL, Address, Topic
 from fieldpose.errors import CodecError, RecordingError, RefusedError
 
@@ -100,6 +100,9 @@ class Store(Protocol):
     def note_dropped(self, key: str, header: Header) -> None:
         """Count a message that was received and for which there was no room in the queue."""
 
+    def note_left_out(self, refused: int, doubted: int) -> None:
+        """Count what was no message, and what was by nobody who is believed."""
+
     def flush_if_due(self) -> float:
         """Hand over what was written lately; return the seconds until the next time."""
 
@@ -113,7 +116,8 @@ class Store(Protocol):
 class Recorder:
     """Records `topics` of `address`, whose parts may be "*", until `close`: into a store, a ring of snapshots, or both.
 
-    open_store: opens the store, once it listens. It answers requests for snapshots at the key of "recorder" there.
+    open_store: opens the store, once it listens. It answers requests for snapshots at the key of "recorder" there. What
+    is by nobody whom Senders believe is counted and left out.
     """
 
     def __init__(
@@ -128,6 +132,8 @@ class Recorder:
         self.error: RecordingError | None = None
         self.snapshots = snapshots
         self._queue = _ByteQueue(queue_bytes)
+        self._senders = Senders(bus, address.site)
+        self._refused = self._doubted = 0
         # Listening begins first: taking over an unfinished recording can last.
         self._listening: list[Closing] = [
             bus.subscribe(address.key(topic), self._sink(topic), _CHANNEL_CAPACITY) for topic in topics
@@ -154,6 +160,8 @@ class Recorder:
         self._end_listening()
         self._queue.end()
         self._thread.join()
+        if self._store is not None:
+            self._store.note_left_out(self._refused, self._doubted)
         if self.snapshots is not None:
             self.snapshots.close()
         if self.error is not None:
@@ -167,9 +175,16 @@ class Recorder:
 
     def _sink(self, topic: Topic[Any]) -> Sink:
         def sink(key: str, payload: bytes, received_ns: int) -> None:
-            if not self._queue.put(_Item(key, topic, payload, received_ns)):
-                with suppress(CodecError):
-                    self._queue.put(_Item(key, topic, decode_header(payload), received_ns))
+            try:
+                header = decode_header(payload)
+            except CodecError:
+                header = None
+            if header is None or len(payload) > topic.max_bytes:
+                self._refused += 1
+            elif self._senders.doubt(topic, key, header) is not None:
+                self._doubted += 1
+            elif not self._queue.put(_Item(key, topic, payload, received_ns)):
+                self._queue.put(_Item(key, topic, header, received_ns))
 
         return sink
 
@@ -187,6 +202,7 @@ class Recorder:
     def _end_listening(self) -> None:
         for listening in self._listening:
             listening.close()
+        self._senders.close()
 
     def _write(self) -> None:
         while (items := self._queue.take(self._flush())) is not None:

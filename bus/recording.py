@@ -55,6 +55,7 @@ class RecordingWriter(OpenRecording):
         expected: Mapping[tuple[str, str], int] | None = None,
     ) -> None:
         self.refused = 0
+        self.doubted = 0
         self._channels: dict[str, int] = {}
         self._schemas: dict[type[Message], int] = {}
         self._sequences = Sequences(from_start, expected)
@@ -119,6 +120,11 @@ class RecordingWriter(OpenRecording):
         """Count a message that was received and is not written."""
         self._count(key, header).received += 1
 
+    def note_left_out(self, refused: int, doubted: int) -> None:
+        """Count what was no message, and what was by nobody who is believed."""
+        self.refused += refused
+        self.doubted += doubted
+
     def close(self, damage: str | None = None, ended: str | None = None) -> bool:
         lossless = self._write_counts({"damage": damage, "ended": ended})
         self._finish()
@@ -160,6 +166,8 @@ class RecordingWriter(OpenRecording):
             counts = {name: str(count) for name, count in asdict(tally).items()}
             self._writer.add_metadata(SOURCE_RECORD, {"key": key, "source": source, **counts})
         values = {"lossless": str(lossless).lower(), "refused": str(self.refused)}
+        if self.doubted:
+            values["doubted"] = str(self.doubted)
         self._writer.add_metadata(RECORDING_RECORD, values | noted)
         return lossless
 

@@ -38,6 +38,8 @@ class Part(Protocol):
 
     def note_dropped(self, key: str, header: Header) -> None: ...
 
+    def note_left_out(self, refused: int, doubted: int) -> None: ...
+
     def flush_if_due(self) -> float: ...
 
     def close(self, damage: str | None = None, ended: str | None = None) -> bool: ...
@@ -81,6 +83,9 @@ class SplitWriter:
 
     def note_dropped(self, key: str, header: Header) -> None:
         self._part.note_dropped(key, header)
+
+    def note_left_out(self, refused: int, doubted: int) -> None:
+        self._part.note_left_out(refused, doubted)
 
     def flush_if_due(self) -> float:
         return self._part.flush_if_due()

@@ -30,6 +30,10 @@ class Tee:
         for store in self._stores:
             store.note_dropped(key, header)
 
+    def note_left_out(self, refused: int, doubted: int) -> None:
+        for store in self._stores:
+            store.note_left_out(refused, doubted)
+
     def flush_if_due(self) -> float:
         return min(store.flush_if_due() for store in self._stores)
 

@@ -36,7 +36,7 @@ class FoxgloveRecording(ForeignRecording):
         before: FoxgloveRecording | None = None,
         resume: bool = False,
     ) -> None:
-        self.refused = self.unwritten = 0
+        self.refused = self.unwritten = self.doubted = 0
         self._address = address
         moved = None if field is None else field.frame.object_from_dataset
         self._converter: Converter = Converter(object_from_dataset=moved) if before is None else before._converter
@@ -75,10 +75,15 @@ class FoxgloveRecording(ForeignRecording):
         self._sequences.seen(key, header)
         self.unwritten += 1
 
+    def note_left_out(self, refused: int, doubted: int) -> None:
+        """Count what was no message, and what was by nobody who is believed."""
+        self.refused += refused
+        self.doubted += doubted
+
     def close(self, damage: str | None = None, ended: str | None = None) -> bool:
         missing = sum(self._sequences.missing.values())
         lossless = self._lossless and not (missing or self.unwritten or self.refused or damage or ended)
-        counts = {"missing": missing, "unwritten": self.unwritten, "refused": self.refused}
+        counts = {"missing": missing, "unwritten": self.unwritten, "refused": self.refused, "doubted": self.doubted}
         noted = {"lossless": str(lossless).lower(), **{name: str(count) for name, count in counts.items()}}
         whys = {name: why for name, why in {"damage": damage, "ended": ended}.items() if why}
         self.add(RECORDING_RECORD, noted | whys)

@@ -14,7 +14,7 @@ from fieldpose.bus.memory import MemoryBus
 from fieldpose.bus.messages import CameraInfo, State
 from fieldpose.bus.ports import Inbox
 from fieldpose.bus.presence import Presence
-from fieldpose.bus.requests import KINDS, ControlValues, decode_request, decode_values
+from fieldpose.bus.requests import KINDS, ControlValues, Show, decode_answer, decode_request
 from fieldpose.bus.topics import ALL, CAMERA_INFO, FRAME, STATE, Address, Topic
 from fieldpose.deploy.fuzzing import seeds
 from fieldpose.deploy.fuzzing.campaign import Input, Target
@@ -69,7 +69,7 @@ def _wire() -> list[Target]:
     plain: tuple[tuple[str, Callable[[bytes], object], list[bytes]], ...] = (
         ("wire/header", decode_header, [_payload(topic) for topic in (FRAME, STATE)]),
         ("wire/request", decode_request, requests),
-        ("wire/answer", decode_values, [answer]),
+        ("wire/answer", lambda payload: decode_answer(payload, Show()), [answer]),
         ("wire/presence", _hear, [word, word.replace(b'"to":""', b'"to":"me"')]),
         ("wire/inbox", _receive, [_payload(topic) for topic in ALL]),
         ("wire/image", _see, [seeds.picture("JPEG"), seeds.picture("PNG"), seeds.picture("PNG", "RGBA")]),
@@ -131,7 +131,7 @@ def _recordings() -> list[Target]:
             pass
 
     def save(folder: Path) -> None:
-        from fieldpose.bus.recording import recover
+        from fieldpose.bus.recovery import recover
 
         recover(folder / _RECORDING, folder / "out.mcap")
 

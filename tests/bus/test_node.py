@@ -59,7 +59,7 @@ class Lenient(JoinedHandler):
 class Plain:
     """A handler made of functions."""
 
-    name = "tracking"
+    name = "rendering"
     inputs: tuple[Topic[Any], ...] = (GUESS,)
     outputs: tuple[Topic[Any], ...] = (GUESS,)
 
@@ -337,7 +337,7 @@ class TestFailures:
             return ()
 
         tracking = Plain(hear)
-        tracking.inputs = (FAILURE,)
+        tracking.name, tracking.inputs = "tracking", (FAILURE,)
         with running(tracking, bus, 0.05), running(Matching(), bus), running(Lenient(), bus):
             outbox = Outbox(bus, ADDRESS, "test")
             for frame_id in range(6):
@@ -528,7 +528,7 @@ class TestStats:
             ready = stats(numbers)
         assert [item.message.ready for item in seen_while_starting] == [False]  # type: ignore[attr-defined]
         assert len(ready) >= 4
-        assert all(each.ready and each.stage == "tracking" for each in ready)
+        assert all(each.ready and each.stage == "rendering" for each in ready)
         assert stats(numbers)[-1].ready is False
         assert ready[-1].rss_mb > 10
         assert ready[-1].cpu_s > 0
@@ -583,7 +583,7 @@ STAGE = """
     from support.bus_samples import ADDRESS
 
     class Stage:
-        name, inputs, outputs = "tracking", (GUESS,), ()
+        name, inputs, outputs = "rendering", (GUESS,), ()
         def start(self):
             print("starting", flush=True)
             time.sleep(float(sys.argv[2]))
@@ -610,7 +610,7 @@ class TestProcesses:
         process = spawn(STAGE, hub, start_s)
         assert process.stdout.readline() == "starting\n"
         if start_s == "0":
-            wait_for(connect(hub), ADDRESS, ["tracking"], 5.0)
+            wait_for(connect(hub), ADDRESS, ["rendering"], 5.0)
         process.send_signal(number)
         out, err = process.communicate(timeout=5.0)
         assert (process.returncode, out, err) == (0, "stopped\n", "")
@@ -620,15 +620,15 @@ class TestProcesses:
         outbox = Outbox(bus, ADDRESS, "test")
         for frame_id in (1, 2):
             process = spawn(STAGE, hub, "0")
-            wait_for(bus, ADDRESS, ["tracking"], 10.0)
+            wait_for(bus, ADDRESS, ["rendering"], 10.0)
             outbox.publish(GUESS, guess(frame_id))
             assert [process.stdout.readline() for _ in range(2)] == ["starting\n", f"got {frame_id}\n"]
             process.kill()
             process.wait()
             deadline = time.monotonic() + 2.0
-            while bus.live(ADDRESS.live("tracking")) and time.monotonic() < deadline:
+            while bus.live(ADDRESS.live("rendering")) and time.monotonic() < deadline:
                 time.sleep(0.01)
-            assert bus.live(ADDRESS.live("tracking")) == set()
+            assert bus.live(ADDRESS.live("rendering")) == set()
 
     def test_a_stage_that_cannot_start_ends_with_its_error(self) -> None:
         def start() -> None:

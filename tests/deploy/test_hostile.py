@@ -75,6 +75,7 @@ def test_a_stranger_on_the_bus_moves_no_pose_and_stops_nothing(tmp_path: Path, m
     assert summary["restarts"] == {}
     assert summary["frames_sent"] == 300
     assert summary["messages"]["lost"] < 10_000
-    assert summary["messages"]["refused"] > 1000
+    assert sum(stats.refused for stats in outcome.stats.values()) > 1000
     for name, sizes in memory_mb.items():
-        assert max(sizes) - sizes[0] < 150, name
+        # Zenoh holds 64 messages of a topic for the recorder, and those of the attack are up to 5 MB.
+        assert max(sizes) - sizes[0] < (450 if name == "recorder" else 150), name

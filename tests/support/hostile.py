@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import json
 import sys
 import threading
@@ -22,6 +23,7 @@ from fieldpose.stages.geometry import exp_se3
 
 Sent = Iterator[tuple[Topic, bytes]]
 ADDRESS = Address()
+LONGEST_S = 150
 FAR_NS = 3600 * 10**9
 SAMPLES = every_message()
 
@@ -40,7 +42,7 @@ class Stranger:
         try:
             state = msgspec.msgpack.decode(payload)
             header = msgspec.convert(state["header"], Header)
-        except (msgspec.MsgspecError, TypeError, KeyError):
+        except (msgspec.MsgspecError, ValueError, TypeError, KeyError):
             return
         if header.source != "tracking" or header.instance == 0:
             return  # his own
@@ -102,6 +104,7 @@ class Stranger:
 
 
 def main(hub: str, seconds: float) -> None:
+    faulthandler.dump_traceback_later(LONGEST_S, exit=True)
     bus = ZenohBus(hub)
     bus.wait_for_hub(120.0)
     stranger, sent = Stranger(bus), Counter[str]()
@@ -112,6 +115,8 @@ def main(hub: str, seconds: float) -> None:
         end, n = time.monotonic() + seconds / (len(attacks) + 1), 0
         while time.monotonic() < end:
             for topic, payload in attack(n):
+                if time.monotonic() > end:
+                    break
                 bus.put(ADDRESS.key(topic, "pnp"), payload, topic)
                 sent[name] += 1
             n += 1

@@ -16,6 +16,7 @@ import pytest
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.processes.pipeline import Progress
 from fieldpose.deploy.reporting.results import RunResult
+from fieldpose.deploy.scene import demo_file
 from fieldpose.stages.geometry import rotation_error_deg, translation_error
 
 HERE = Path(__file__).resolve().parent.parent
@@ -49,11 +50,14 @@ def test_a_stranger_on_the_bus_moves_no_pose_and_stops_nothing(tmp_path: Path, m
         runs.append(outcome)
         return summarise(outcome)
 
-    monkeypatch.setattr("fieldpose.deploy.commands.demo.live_line", lambda title: nullcontext(report))
-    monkeypatch.setattr("fieldpose.deploy.commands.demo.summarise", kept)
+    monkeypatch.setattr("fieldpose.deploy.commands.run.live_line", lambda title: nullcontext(report))
+    monkeypatch.setattr("fieldpose.deploy.commands.run.summarise", kept)
+    field, source = str(demo_file("field.safetensors")), f"mcap:{demo_file('sequence.mcap')}"
+    files = ["--json", str(tmp_path / "summary.json"), "--record", str(tmp_path / "recording.mcap")]
     try:
         slow = ["--camera.rate-hz", "15", "--rendering.size", "128", "--tracking.guess", "train:047"]
-        assert main(["demo", "--out", str(tmp_path), "--no-video", *slow]) == 0
+        # Where certificates are asked for, nobody gets as far as this.
+        assert main(["run", field, "--source", source, "--open", *files, *slow]) == 0
         said, _ = strangers[0].communicate(timeout=30)
     finally:
         for stranger in strangers:

@@ -30,6 +30,7 @@ _LOCAL_PEER = "tcp/127.0.0.1:0"
 _POOL_BYTES = 32 << 20
 """A sender comes to use all of it before it uses any again; room for five full-HD images as pixels."""
 _QUESTIONS = 64
+_SIGNAL_S = 0.5
 _ASK_AGAIN_S, _LEAST_S = 0.05, 0.01
 _ENDPOINT = re.compile(r"[a-z]+/.+:\d{1,5}([?#].*)?")
 _PRIORITIES = {"data": zenoh.Priority.DATA, "data_low": zenoh.Priority.DATA_LOW}
@@ -222,7 +223,9 @@ def serve_hub(
     with StopSignals(stop) as signals:
         session = open_session({**router, **closing(access), **(settings or {})}, what)
         try:
-            signals.stop.wait()
+            # A signal that the kernel gives to another thread of this process ends no wait that has no end.
+            while not signals.stop.wait(_SIGNAL_S):
+                pass
         finally:
             session.close()
 

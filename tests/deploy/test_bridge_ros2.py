@@ -33,7 +33,7 @@ from zenoh_ros2_sdk.session import ZenohSession
 
 from fieldpose.bus.messages import Frame, Prior, Reason, State, TrackingState
 from fieldpose.bus.ports import Inbox, Outbox, first_header
-from fieldpose.bus.protocol import Closer
+from fieldpose.bus.protocol import Closer, Closing
 from fieldpose.bus.ros2 import RosNames, RosTopic, attachment, gid_of
 from fieldpose.bus.topics import FRAME, PRIOR, STATE, Address
 from fieldpose.bus.transport import ZenohBus, serve_hub
@@ -560,6 +560,9 @@ class _Nowhere:
 
     def put(self, key: str, payload: bytes, topic: Any) -> None:
         self.put_on.append(topic.name)
+
+    def hold(self, key: str) -> Closing:
+        return Closer(lambda: None)
 
     def publisher(self, topic: RosTopic) -> Callable[[bytes], None]:
         return lambda payload: None

@@ -33,7 +33,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_video_becomes_poses_and_what_is_there_is_not_done_again(video: Path, tmp_path: Path) -> None:
     out, told = tmp_path / "room", tmp_path / "told.json"
-    given = ("start", video, "--out", out, "--minutes", "0.1", "--json", told)
+    given = ("start", video, "--out", out, "--minutes", "0.25", "--json", told)
     first = fieldpose(*given, cwd=tmp_path, timeout_s=240)
     assert first.returncode == 0, first.stderr
     steps = json.loads(told.read_text())["steps"]

@@ -38,6 +38,12 @@ def plan_of(recording: Path) -> Plan:
     return planned(recorded_settings(recording), FIELD)
 
 
+@pytest.fixture(autouse=True)
+def threads_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This process and what it starts keep the number of threads that they have."""
+    monkeypatch.setattr("fieldpose.deploy.commands.replay.hold_to", lambda threads: None)
+
+
 @pytest.fixture(scope="module")
 def parts() -> Parts:
     """Loaded once: the sequences' settings are the same, and no view is used for another pose than its own."""

@@ -302,3 +302,21 @@ def print_chaos(figures: dict[str, Any]) -> None:
     console.print(
         f"{figures['machine']}; poses said to be tracking that were wrong: {len(figures['wrong'])}", highlight=False
     )
+
+
+def print_endurance(figures: dict[str, Any]) -> None:
+    """A row for each minute, and by how much memory has grown."""
+    console = result_console()
+    table = Table(title=f"{figures['seconds'] / 60:g} minutes at {figures['rate_hz']:g} Hz", title_justify="left")
+    for name in ("minute", "frames", "answered", "sure", "wrong", "latency p50, p99, ms", "memory of all, MB"):
+        table.add_column(name, justify="right")
+    for number, minute in enumerate(figures["minutes"]):
+        latency = minute["latency_ms"]
+        counts = (str(minute[name]) for name in ("sent", "states", "sure", "wrong"))
+        spread = "-" if latency is None else f"{latency['p50']:.1f}, {latency['p99']:.1f}"
+        table.add_row(str(number), *counts, spread, f"{sum(minute['rss_mb'].values()):.0f}")
+    console.print(table)
+    if figures["growth"] is not None:
+        grown = ", ".join(f"{name} {share:+.1%}" for name, share in figures["growth"].items())
+        console.print(f"memory after the first minute: {grown}", highlight=False)
+    console.print(f"{figures['machine']}; restarts: {figures['restarts']}", highlight=False)

@@ -14,6 +14,7 @@ import tyro
 from fieldpose.deploy.benchmarks import tables
 from fieldpose.deploy.benchmarks.isa import Isa, limited_to
 from fieldpose.deploy.commands.bench_chaos import Chaos
+from fieldpose.deploy.commands.bench_endure import Endure
 from fieldpose.deploy.commands.bench_fuzz import Fuzz
 from fieldpose.deploy.commands.bench_mesh import Mesh
 from fieldpose.deploy.commands.bench_record import Record
@@ -299,6 +300,7 @@ class Options:
         | Annotated[Mesh, tyro.conf.subcommand("mesh")]
         | Annotated[Chaos, tyro.conf.subcommand("chaos")]
         | Annotated[Fuzz, tyro.conf.subcommand("fuzz")]
+        | Annotated[Endure, tyro.conf.subcommand("endure")]
     ]
 
     def run(self) -> int:

@@ -7,7 +7,7 @@ import re
 import shutil
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import zenoh
@@ -22,10 +22,12 @@ from fieldpose.bus.topics import Topic
 from fieldpose.errors import TransportError
 
 __all__ = [
-    "LOCAL_HUB", "Bus", "Closing", "MemoryBus", "Sink", "Watcher", "ZenohBus", "serve_hub", "wait_for",
+    "LOCAL_HUB", "WITHOUT_SHARED_MEMORY", "Bus", "Closing", "MemoryBus", "Sink", "Watcher", "ZenohBus", "serve_hub",
+    "wait_for",
 ]  # fmt: skip
 
 LOCAL_HUB = "tcp/127.0.0.1:7447"
+WITHOUT_SHARED_MEMORY = {"transport/shared_memory/enabled": False}
 _LOCAL_PEER = "tcp/127.0.0.1:0"
 _POOL_BYTES = 32 << 20
 """A sender comes to use all of it before it uses any again; room for five full-HD images as pixels."""
@@ -34,6 +36,11 @@ _SIGNAL_S = 0.5
 _ASK_AGAIN_S, _LEAST_S = 0.05, 0.01
 _ENDPOINT = re.compile(r"[a-z]+/.+:\d{1,5}([?#].*)?")
 _PRIORITIES = {"data": zenoh.Priority.DATA, "data_low": zenoh.Priority.DATA_LOW}
+_PATIENT = {
+    "connect/timeout_ms": -1,
+    "connect/exit_on_failure": False,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+}
 # A message waits this long for a receiver that is busy for a moment; while one takes nothing at all, what is meant
 # for it is dropped at once. BLOCK would let it throttle everyone and close its link after 5 s; BLOCK_FIRST lost one
 # image in a few hundred to receivers that were not slow at all.
@@ -58,9 +65,7 @@ class ZenohBus:
         peer = {
             "mode": "peer",
             "connect/endpoints": [self._hub],
-            "connect/timeout_ms": -1,
-            "connect/exit_on_failure": False,
-            "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5},
+            **_PATIENT,
             "listen/endpoints": [checked_endpoint(listen)],
             "transport/shared_memory/transport_optimization/pool_size": _POOL_BYTES,
             "transport/shared_memory/transport_optimization/enabled": _shared_memory_fits(),
@@ -212,13 +217,16 @@ def feed(channel: Any, sink: Sink) -> None:
 
 def serve_hub(
     listen: str = LOCAL_HUB, settings: Mapping[str, Any] | None = None, stop: threading.Event | None = None,
-    access: Access | None = None,
+    access: Access | None = None, others: Sequence[str] = (),
 ) -> None:  # fmt: skip
     """Be the meeting point of all processes until SIGTERM, SIGINT or `stop`.
 
-    access: as of `ZenohBus`. Raises TransportError where it cannot listen, as on a port in use.
+    access: as of `ZenohBus`. others: hubs that messages are passed to and from; they may come and go. Raises
+    TransportError where it cannot listen, as on a port in use.
     """
-    router = {"mode": "router", "listen/endpoints": [checked_endpoint(listen)]}
+    router: dict[str, Any] = {"mode": "router", "listen/endpoints": [checked_endpoint(listen)]}
+    if others:
+        router |= {"connect/endpoints": [checked_endpoint(other) for other in others], **_PATIENT}
     what = f"no hub at {listen}: is another one running there, or another program? Choose a free port"
     with StopSignals(stop) as signals:
         session = open_session({**router, **closing(access), **(settings or {})}, what)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fieldpose.bus.access import Access, certificate_of, key_of
-from fieldpose.bus.transport import ZenohBus, checked_endpoint
+from fieldpose.bus.transport import WITHOUT_SHARED_MEMORY, ZenohBus, checked_endpoint
 from fieldpose.deploy.access.refused import nobody, speaks_tls, why_refused
 from fieldpose.deploy.access.roles import role_named, roles
 from fieldpose.deploy.access.run_keys import keys_for, keys_of
@@ -56,10 +56,11 @@ class Joint:
     access: Access | None = None
     coming: bool = False
 
-    def session(self, listen: str | None = None) -> ZenohBus:
+    def session(self, listen: str | None = None, shared_memory: bool = True) -> ZenohBus:
         """A session that listens for the others. Raises TransportError."""
         at = listen or peer_address(self.hub)
-        return ZenohBus(self.hub, at if self.access is None else with_scheme(at, "tls"), access=self.access)
+        at = at if self.access is None else with_scheme(at, "tls")
+        return ZenohBus(self.hub, at, None if shared_memory else WITHOUT_SHARED_MEMORY, self.access)
 
     def wait(self, bus: ZenohBus, timeout_s: float) -> None:
         """Return once the hub answers. Raises TransportError that says why, as soon as that is known."""

@@ -33,12 +33,14 @@ from fieldpose.deploy.graph import (
 )  # fmt: skip
 from fieldpose.deploy.parts import Parts
 from fieldpose.deploy.plan import Plan, resolve
+from fieldpose.deploy.processes.endpoints import with_scheme
 from fieldpose.deploy.processes.lifeline import die_with_parent
 from fieldpose.deploy.processes.preload import field_of, pipelines_of
 from fieldpose.deploy.processes.threads import hold_to
 from fieldpose.deploy.processes.warmup import compile_kernels
 from fieldpose.deploy.recording_options import RecordingOptions
 from fieldpose.deploy.settings import Settings
+from fieldpose.deploy.sharing import Share
 from fieldpose.errors import UsageError
 
 if TYPE_CHECKING:
@@ -80,6 +82,15 @@ class Options:
     )
     pipelines: Path | None = None
     """A file that lists several pipelines, their settings and fields; this process serves them in turn."""
+    share: str | None = None
+    """Which part of these it serves where several processes of one stage do, each with its own part: 1/2 and 2/2. As
+    many each, or one more; a pipeline is never split."""
+    join: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = ()
+    """Another hub that this hub passes messages to and from, where a site has one for each of several groups of hosts;
+    may be given again. Who is ready is known within a group."""
+    shared_memory: bool = True
+    """Exchange images with processes of this host through /dev/shm; not possible where it is not shared, as between
+    most containers."""
     threads: int | None = None
     """Threads that it may use (default: by the graph)."""
     wait_for: tuple[str, ...] | None = None
@@ -98,7 +109,7 @@ class Options:
         row = BY_NAME[self.name]
         log = log_to_stderr(roles=row.make is None, say=stage_logger(row.name).warning)
         if row.make is None:
-            _serve_hub(self.listen or self.connect, self.entry)
+            _serve_hub(self.listen or self.connect, self.entry, self.join)
         else:
             _serve(self, row, row.make)
         if supervised:
@@ -109,12 +120,15 @@ class Options:
         return 0
 
 
-def _serve_hub(listen: str, entry: Entry) -> None:
+def _serve_hub(listen: str, entry: Entry, others: tuple[str, ...]) -> None:
     with hub_keys(listen, entry) as (at, keys):
-        serve_hub(at, access=None if keys is None else access_as(keys, HUB))
+        those = others if keys is None else tuple(with_scheme(other, "tls") for other in others)
+        serve_hub(at, access=None if keys is None else access_as(keys, HUB), others=those)
 
 
 def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handler]) -> None:
+    if options.join:
+        raise UsageError(f"--join is of the hub; {row.name} joins one by --connect")
     served = _served(options, row)
     plans = tuple(plan for plan, _ in served)
     threads = options.threads or threads_of(row, max(plan.in_flight for plan in plans))
@@ -130,7 +144,7 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     way = joint(options.connect, options.entry, (row.name,), _START_S)
     if options.listen is not None and way.access is None and not options.entry.open:
         check_kept_out(options.listen)
-    bus = way.session(options.listen)
+    bus = way.session(options.listen, options.shared_memory)
     for plan in plans:
         _tell(plan, row)
 
@@ -154,11 +168,17 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
 
 def _served(options: Options, row: Process) -> list[tuple[Plan, Field | None]]:
     """The plans that the process serves, each with its field if it needs that."""
+    share = None if options.share is None else Share.parse(options.share)
+    if share is not None and (row.serves != "run" or row.name == RECORDER or options.pipelines is None):
+        several = ", ".join(one.name for one in GRAPH if one.serves == "run" and one.name in STAGES)
+        raise UsageError(f"--share is of the pipelines that --pipelines FILE lists, for {several}")
     if options.pipelines is None:
         return [planned(options, row)]
     those = [one.read() for one in pipelines_of(options.pipelines) if row.name in one.processes]
     if not those:
         raise UsageError(f"{options.pipelines}: lists no pipeline that has a process {row.name}")
+    if share is not None:
+        those = share.take(those)
     return [planned(replace(options, settings=settings, field=field), row) for settings, field in those]
 
 

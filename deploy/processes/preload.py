@@ -29,18 +29,24 @@ class Pipeline(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     field: str | None
     processes: tuple[str, ...]
 
+    def within(self, folder: Path) -> Pipeline:
+        """The same, where its paths count from a folder."""
+        field = None if self.field is None else str(folder / self.field)
+        return msgspec.structs.replace(self, settings=str(folder / self.settings), field=field)
+
     def read(self) -> tuple[Settings, Path | None]:
         """Its settings, and where its field is. Raises ConfigError."""
         return read_settings(self.settings), None if self.field is None else Path(self.field)
 
 
 def pipelines_of(file: str | Path) -> list[Pipeline]:
-    """The pipelines of a run, as `programs` has listed them. Raises ConfigError."""
-    content = read_file(Path(file))
+    """The pipelines of a run, as `programs` has listed them; paths count from the file's folder. Raises ConfigError."""
+    content, folder = read_file(Path(file)), Path(file).parent
     try:
-        return msgspec.convert(content.get("pipelines"), list[Pipeline])
+        listed = msgspec.convert(content.get("pipelines"), list[Pipeline])
     except msgspec.ValidationError as error:
         raise ConfigError(f"{file}: no list of pipelines as `fieldpose run` leaves it: {error}") from error
+    return [one.within(folder) for one in listed]
 
 
 def preload(file: str) -> None:

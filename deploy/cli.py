@@ -31,6 +31,7 @@ COMMANDS = {
     "view": "a page that shows a running pipeline, or a recording",
     "stage": "one process of the pipeline, for another host or a debugger",
     "certs": "certificates by role, for a pipeline on several hosts",
+    "deploy": "files that start a pipeline on several hosts: Docker Compose, Kubernetes, systemd",
     "record": "record a pipeline that is running",
     "control": "reset the tracking of a pipeline that is running, give it a guess, or ask how it is",
     "bridge": "a running pipeline as a node of ROS 2, or live in Foxglove",

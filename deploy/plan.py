@@ -33,7 +33,7 @@ class Plan:
     """A pipeline to be run: its field, and settings with nothing left open but the pace of a source that is elsewhere.
 
     looks: whether retrieval can be asked. follows: whether every frame is followed. notes: what was decided, and why,
-    by name.
+    by name. given: the settings before anything was decided.
     """
 
     settings: Settings
@@ -42,6 +42,7 @@ class Plan:
     follows: bool = False
     begins: Beginning = dataclasses.field(default_factory=Beginning)
     notes: dict[str, str] = dataclasses.field(default_factory=dict)
+    given: Settings = dataclasses.field(default_factory=Settings)
 
     @property
     def independent(self) -> bool:
@@ -87,7 +88,7 @@ def resolve(settings: Settings, views: TrainingViews | None, field: Path | None 
         matching=replace(settings.matching, device=_device(settings.matching.device, backend)),
         refinement=_refinement(settings.refinement, sequence, notes),
     )
-    return Plan(resolved_settings, field, looks, follows, begins, notes)
+    return Plan(resolved_settings, field, looks, follows, begins, notes, settings)
 
 
 def _sequence(settings: Settings, notes: dict[str, str]) -> Sequence:

@@ -1,0 +1,106 @@
+"""A site as units of systemd, of which each host enables those that it is to run."""
+
+from __future__ import annotations
+
+from fieldpose.deploy.graph import HUB
+from fieldpose.deploy.hosts.services import CACHE, FIELDS, PORT, STATE, Service, Site
+
+_CERTIFICATES = f"{STATE}/certs"
+_HUB = "${FIELDPOSE_HUB}"
+TARGET = "fieldpose.target"
+_MORE_S = 5
+_HARDENING = """NoNewPrivileges=yes
+CapabilityBoundingSet=
+AmbientCapabilities=
+ProtectSystem=strict
+ProtectHome=tmpfs
+ProtectClock=yes
+ProtectControlGroups=yes
+ProtectHostname=yes
+ProtectKernelLogs=yes
+ProtectKernelModules=yes
+ProtectKernelTunables=yes
+ProtectProc=invisible
+PrivateTmp=yes
+LockPersonality=yes
+RestrictNamespaces=yes
+RestrictRealtime=yes
+RestrictSUIDSGID=yes
+RestrictAddressFamilies=AF_INET AF_INET6 AF_UNIX AF_NETLINK
+SystemCallArchitectures=native
+SystemCallFilter=@system-service
+SystemCallErrorNumber=EPERM
+UMask=0077"""
+
+
+def files(site: Site, executable: str) -> dict[str, bytes]:
+    """The files of a folder, by their names in it. executable: where `fieldpose` is on the hosts."""
+    units = {f"{unit_name(service)}": _unit(service, site, executable).encode() for service in site.services}
+    return {
+        TARGET: f"{site.note}[Unit]\nDescription=fieldpose\n\n[Install]\nWantedBy=multi-user.target\n".encode(),
+        **units,
+        "fieldpose-sysusers.conf": f'{site.note}u fieldpose - "fieldpose" {STATE}\n'.encode(),
+        "hub.env": f"{site.note}FIELDPOSE_HUB=tls/127.0.0.1:{PORT}\n".encode(),
+        **{f"config/{name}": content for name, content in site.files.items()},
+    }
+
+
+def unit_name(service: Service) -> str:
+    return f"fieldpose-{service.name}.service"
+
+
+def _unit(service: Service, site: Site, executable: str) -> str:
+    environment = "\n".join(f"Environment={name}={value}" for name, value in service.environment.items())
+    keys = "\n".join(f"LoadCredential={name}:{_CERTIFICATES}/{name}" for name in service.certificates)
+    words = [executable, *service.command(_HUB, "%d", shared_memory=True)]
+    command = " \\\n  ".join(_quoted(word) for word in words)
+    after = "network-online.target" if service.row.name == HUB else f"network-online.target fieldpose-{HUB}.service"
+    return f"""{site.note}[Unit]
+Description=fieldpose {service.name}
+PartOf={TARGET}
+Wants=network-online.target
+After={after}
+# However often it dies; 2 is what only people can mend.
+StartLimitIntervalSec=0
+
+[Service]
+Type=exec
+EnvironmentFile=/etc/fieldpose/hub.env
+{environment}
+# Its own role's certificate and key, which no other unit sees.
+{keys}
+ExecStart={command}
+Restart=on-failure
+RestartSec=1
+RestartPreventExitStatus=2
+TimeoutStopSec={service.row.stop_s + _MORE_S:g}
+MemoryMax={service.memory_mb}M
+User=fieldpose
+{_given(service)}
+{_HARDENING}
+
+[Install]
+WantedBy={TARGET}
+"""
+
+
+def _given(service: Service) -> str:
+    lines = [f"CacheDirectory={CACHE.rpartition('/')[2]}"]
+    if service.writes:
+        lines.append(f"StateDirectory={STATE.rpartition('/')[2]}")
+    # /dev/shm stays shared; the certificates of others do not.
+    lines.append(f"InaccessiblePaths=-{_CERTIFICATES}")
+    if service.with_fields:
+        lines.append(f"ReadOnlyPaths={FIELDS}")
+    if service.reads is not None:
+        lines.append(f"BindReadOnlyPaths={service.reads}")
+    if service.device is None:
+        return "\n".join([*lines, "PrivateDevices=yes"])
+    return "\n".join([*lines, "SupplementaryGroups=video", "DevicePolicy=closed", f"DeviceAllow={service.device} rw"])
+
+
+def _quoted(word: str) -> str:
+    # A dollar and a percent sign of a path would be taken for variables; the hub's and %d are meant so.
+    if word not in (_HUB, "%d"):
+        word = word.replace("%", "%%").replace("$", "$$")
+    return f'"{word}"' if " " in word else word

@@ -51,7 +51,8 @@ class Joiner:
 
     The other inputs wait for it in rings. What there is one of a frame is joined without regard to the pass, and stays
     in its ring for later ones. The capture time belongs to the key, so that frames of a camera that started again are
-    not mixed up.
+    not mixed up. A camera sends its frames in their order, so that one is not waited for any more once a later one is
+    there, as after a link was cut.
     """
 
     def __init__(self, inputs: tuple[Topic[Any], ...], timeout_s: float = 1.0) -> None:
@@ -66,7 +67,7 @@ class Joiner:
             self._waiting[_key(topic, message.header)] = _Waiting(message, now_ns + self._timeout_ns)
         else:
             self._keep(topic, message)
-        yield from [self._release(key) for key in list(self._waiting) if not self._missing(key)]
+        yield from [self._release(key) for key in list(self._waiting) if self._is_decided(key)]
         while len(self._waiting) > JOIN_CAPACITY:
             yield self._release(next(iter(self._waiting)))
 
@@ -82,6 +83,17 @@ class Joiner:
         ring.move_to_end(key)
         if len(ring) > kept(topic):
             ring.popitem(last=False)
+
+    def _is_decided(self, key: Key) -> bool:
+        """Whether all inputs are there, or one will not come."""
+        header, missing = self._waiting[key].message.header, self._missing(key)
+        return not missing or any(self._is_past(topic, header) for topic in missing)
+
+    def _is_past(self, topic: Topic[Any], header: Header) -> bool:
+        """Whether a camera has sent that of a later frame."""
+        if not (topic.of_frame and topic.newest_only):
+            return False
+        return any(number > header.frame_id and at > header.capture_ns for number, _, at in self._rings[topic])
 
     def _missing(self, key: Key) -> tuple[Topic[Any], ...]:
         header = self._waiting[key].message.header

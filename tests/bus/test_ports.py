@@ -240,6 +240,23 @@ class TestJoiner:
         assert list(joiner.expire(10 * SECOND_NS)) == []
         assert list(joiner.add(FRAME, frame(1), 0)) == []
 
+    @pytest.mark.parametrize("topic", [FRAME, CAMERA_INFO])
+    def test_what_a_camera_has_left_behind_is_not_waited_for(self, topic: Topic[Any]) -> None:
+        joiner = Joiner((VIEW, topic))
+        list(joiner.add(VIEW, view(5), 0))
+        assert list(joiner.add(topic, ONE_A_FRAME[topic](4), 0)) == []
+        (joined,) = joiner.add(topic, ONE_A_FRAME[topic](6), 0)
+        assert (joined.header.frame_id, joined.missing) == (5, (topic,))
+        (joined,) = joiner.add(VIEW, view(5, 1), 0)
+        assert joined.missing == (topic,)
+        assert joined_ids(joiner.add(VIEW, view(6), 0)) == [(6, 0)]
+
+    def test_what_others_send_of_a_frame_may_come_in_any_order(self) -> None:
+        joiner = Joiner((VIEW, PRIOR))
+        list(joiner.add(VIEW, view(5), 0))
+        assert list(joiner.add(PRIOR, prior(6), 0)) == []
+        assert joined_ids(joiner.add(PRIOR, prior(5), 0)) == [(5, 0)]
+
     def test_memory_is_bounded_and_nothing_that_drives_is_lost(self) -> None:
         joiner = Joiner((VIEW, FRAME))
         out = [each for frame_id in range(200) for each in joiner.add(VIEW, view(frame_id), 0)]

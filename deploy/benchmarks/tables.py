@@ -320,3 +320,30 @@ def print_endurance(figures: dict[str, Any]) -> None:
         grown = ", ".join(f"{name} {share:+.1%}" for name, share in figures["growth"].items())
         console.print(f"memory after the first minute: {grown}", highlight=False)
     console.print(f"{figures['machine']}; restarts: {figures['restarts']}", highlight=False)
+
+
+def print_scale(figures: dict[str, Any]) -> None:
+    """Each topic of one camera, and what many cameras take."""
+    console = result_console()
+    table = Table(title="one camera", title_justify="left")
+    for name in ("topic", "a second", "kB/s", "readers"):
+        table.add_column(name, justify="left" if name == "topic" else "right")
+    for name, flow in figures["topics"].items():
+        table.add_row(name, f"{flow['per_s']:.1f}", f"{flow['bytes_per_s'] / 1e3:.1f}", str(flow["readers"]))
+    console.print(table)
+    table = Table(title="cameras", title_justify="left")
+    names = (
+        "cameras", "processes", "links", "MB/s sent", "delivered", "gaps", "skipped", "age, ms: 50%", "99%",
+        "behind, ms", "cores", "of the hub", "hub, MB",
+    )  # fmt: skip
+    for name in names:
+        table.add_column(name, justify="right")
+    for count, row in figures["cameras"].items():
+        table.add_row(
+            count, str(row["processes"]), str(row["links"]), f"{row['mb_per_s_sent']:.2f}",
+            f"{row['mb_per_s_delivered']:.2f}", str(row["gaps"]), str(row["skipped"]), f"{row['age_ms']['p50']:.1f}",
+            f"{row['age_ms']['p99']:.1f}", f"{row['behind_ms']:.1f}", f"{row['cpu']['all']:.2f}",
+            f"{row['hub_cpu']:.3f}", f"{row['hub_rss_mb']:.0f}",
+        )  # fmt: skip
+    console.print(table)
+    console.print(f"{figures['machine']}; load before {figures['load_before']:.1f}", highlight=False)

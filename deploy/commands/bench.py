@@ -18,6 +18,7 @@ from fieldpose.deploy.commands.bench_endure import Endure
 from fieldpose.deploy.commands.bench_fuzz import Fuzz
 from fieldpose.deploy.commands.bench_mesh import Mesh
 from fieldpose.deploy.commands.bench_record import Record
+from fieldpose.deploy.commands.bench_scale import Scale
 from fieldpose.deploy.reporting.output import check_writable, progress_console, write_json
 from fieldpose.deploy.scene import demo_file
 from fieldpose.errors import UsageError
@@ -295,6 +296,7 @@ class Options:
         | Annotated[Match, tyro.conf.subcommand("match")]
         | Annotated[Bus, tyro.conf.subcommand("bus")]
         | Annotated[Record, tyro.conf.subcommand("record")]
+        | Annotated[Scale, tyro.conf.subcommand("scale")]
         | Annotated[Track, tyro.conf.subcommand("track")]
         | Annotated[Start, tyro.conf.subcommand("start")]
         | Annotated[Mesh, tyro.conf.subcommand("mesh")]

@@ -23,7 +23,7 @@ CONFIG, FIELDS, STATE, CACHE = "/etc/fieldpose", "/srv/fieldpose/fields", "/var/
 PORT = 7447
 EVERYWHERE = f"tls/0.0.0.0:{PORT}"
 _NOT_IN_NAMES = re.compile(r"[^a-z0-9]+")
-_HUB_MB, _USUAL_MB = 512, 2048
+_MEMORY_MB = 2048
 """Far above what a process uses, for a limit is to save the host from one that has gone wrong."""
 _SOURCES_OF_FILES = ("folder", "dataset", "video", "mcap", "bag")
 
@@ -62,7 +62,7 @@ class Service:
 
     @property
     def memory_mb(self) -> int:
-        return _HUB_MB if self.row.name == HUB else _USUAL_MB
+        return _MEMORY_MB
 
     def command(self, hub: str, tls: str, shared_memory: bool) -> list[str]:
         """Its arguments, with the hub's address and the folder of its certificates."""

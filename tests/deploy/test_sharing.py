@@ -136,7 +136,7 @@ def test_two_rendering_processes_answer_each_guess_of_two_cameras_once_and_both_
         ]  # fmt: skip
         bus = ZenohBus(address)
         with ending(subprocess.Popen(shares[0])), ending(subprocess.Popen(shares[1])) as second:
-            inbox = Inbox(bus, replace(LEFT, camera="*"), [VIEW, FAILURE])
+            inbox = Inbox(bus, replace(LEFT, camera="*"), [VIEW, FAILURE], {VIEW: 4 * FRAMES})
             wait_for(bus, LEFT, ["rendering", f"{RIGHT.pair}/rendering"], READY_S)
             to_left, to_right = (Outbox(bus, at, "tracking") for at in (LEFT, RIGHT))
             for number in range(FRAMES):

@@ -6,15 +6,13 @@ Both need rights that root has, on Linux. Hosts are network namespaces of this m
 from __future__ import annotations
 
 import csv
-import secrets
-import signal
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +25,7 @@ from fieldpose.deploy.benchmarks.chaos.events import PAUSE_S, Event, Kind
 from fieldpose.deploy.benchmarks.chaos.judging import Verdict, Wrong, back_s
 from fieldpose.deploy.benchmarks.chaos.rounds import Played
 from fieldpose.deploy.benchmarks.sequences import Sequence as Followed
+from fieldpose.deploy.benchmarks.two_hosts import two_hosts
 from fieldpose.deploy.reporting.results import FrameResult
 from fieldpose.errors import FieldposeError
 
@@ -35,13 +34,13 @@ _DISK_MB = 36
 """Of which a recorder keeps 16 free for the end of its file."""
 _DISK_FRAMES = 300
 _PORT = 7447
-_READY_S, _BEFORE_S, _AFTER_S, _END_S = 120.0, 4.0, 4.0, 20.0
+_READY_S, _BEFORE_S, _AFTER_S = 120.0, 4.0, 4.0
 
 
 def missing_rights() -> dict[Kind, str]:
     """What cannot be done here, and why."""
     found = {}
-    for kind, tries in ((Kind.CUT, _two_hosts), (Kind.FULL, _small_disk)):
+    for kind, tries in ((Kind.CUT, two_hosts), (Kind.FULL, _small_disk)):
         try:
             with tries():
                 pass
@@ -54,7 +53,7 @@ def missing_rights() -> dict[Kind, str]:
 def cut(source: Path, followed: Followed) -> Played:
     """The camera on one host, everything else on another, and no link between them for PAUSE_S."""
     verdict = Verdict(Event(Kind.CUT), away_s=PAUSE_S)
-    with _two_hosts() as hosts, tempfile.TemporaryDirectory(prefix="fieldpose-chaos-") as folder:
+    with two_hosts() as hosts, tempfile.TemporaryDirectory(prefix="fieldpose-chaos-") as folder:
         rows = Path(folder) / "run.csv"
         hub, keys = f"tls/{hosts.stages_at}:{_PORT}", Path(folder) / "keys"
         written = ("--csv", rows, "--tls", keys)
@@ -62,17 +61,17 @@ def cut(source: Path, followed: Followed) -> Played:
         subprocess.run(_command("certs", keys, *addresses), check=True, capture_output=True)
         with ExitStack() as closing:
             run = closing.enter_context(
-                _started(hosts.stages, "run", followed.field, "--source", "bus", "--listen", hub, *written)
+                hosts.started(hosts.stages, "run", followed.field, "--source", "bus", "--listen", hub, *written)
             )
             _wait_for_line(run, "running\n")
             there = ("--connect", hub, "--listen", f"tls/{hosts.camera_at}:0", "--field", followed.field, "--tls", keys)
             film = ("--camera.source", f"mcap:{source}")
-            closing.enter_context(_started(hosts.camera, "stage", "camera", *there, *film))
+            closing.enter_context(hosts.started(hosts.camera, "stage", "camera", *there, *film))
             time.sleep(_BEFORE_S)
             began_ns = time.time_ns()
-            hosts.link("down")
+            hosts.cut()
             time.sleep(PAUSE_S)
-            hosts.link("up")
+            hosts.mend()
             gone_ns = time.time_ns()
             time.sleep(_AFTER_S)
         frames, wrong = _read(rows, followed)
@@ -111,35 +110,6 @@ def _readable(recording: Path, saved: Path) -> int:
     return recover(unfinished, saved) if unfinished.exists() else info(recording).messages
 
 
-@dataclass(frozen=True)
-class _Hosts:
-    camera: str
-    stages: str
-    camera_at: str
-    stages_at: str
-
-    def link(self, state: str) -> None:
-        _ip("-n", self.camera, "link", "set", "veth0", state)
-
-
-@contextmanager
-def _two_hosts() -> Iterator[_Hosts]:
-    mark = secrets.token_hex(2)
-    camera, stages = f"fieldpose-{mark}-a", f"fieldpose-{mark}-b"
-    net = f"10.{int(mark[:2], 16)}.{int(mark[2:], 16)}"
-    hosts = _Hosts(camera, stages, f"{net}.1", f"{net}.2")
-    with ExitStack() as closing:
-        for name in (camera, stages):
-            _ip("netns", "add", name)
-            closing.callback(_ip, "netns", "del", name)
-        _ip("link", "add", "veth0", "netns", camera, "type", "veth", "peer", "name", "veth0", "netns", stages)
-        for name, address in ((camera, hosts.camera_at), (stages, hosts.stages_at)):
-            _ip("-n", name, "addr", "add", f"{address}/24", "dev", "veth0")
-            for device in ("lo", "veth0"):
-                _ip("-n", name, "link", "set", device, "up")
-        yield hosts
-
-
 @contextmanager
 def _small_disk() -> Iterator[Path]:
     with tempfile.TemporaryDirectory(prefix="fieldpose-disk-") as folder:
@@ -152,27 +122,8 @@ def _small_disk() -> Iterator[Path]:
             subprocess.run(["umount", folder], check=True, capture_output=True)
 
 
-def _ip(*arguments: str) -> None:
-    subprocess.run(["ip", *arguments], check=True, capture_output=True)
-
-
 def _command(*arguments: object) -> list[str]:
     return [*_FIELDPOSE, *map(str, arguments)]
-
-
-@contextmanager
-def _started(host: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    command = ["ip", "netns", "exec", host, *_command(*arguments)]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    try:
-        yield process
-    finally:
-        process.send_signal(signal.SIGINT)
-        try:
-            process.communicate(timeout=_END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.communicate()
 
 
 def _wait_for_line(process: subprocess.Popen[str], end: str) -> None:

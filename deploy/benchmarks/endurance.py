@@ -70,9 +70,10 @@ def growth(minutes: Sequence[dict[str, Any]]) -> dict[str, float] | None:
 
     The first is left out, for then everything is loaded and cached. None for runs of less than three minutes.
     """
-    if len(minutes) < 3:
+    looked_at = [minute["rss_mb"] for minute in minutes if minute["rss_mb"]]
+    if len(looked_at) < 3:
         return None
-    first, last = minutes[1]["rss_mb"], minutes[-1]["rss_mb"]
+    first, last = looked_at[1], looked_at[-1]
     grown = {name: last[name] / first[name] - 1 for name in first if name in last}
     return {**grown, "all": sum(last.values()) / sum(first.values()) - 1}
 

@@ -15,6 +15,7 @@ from fieldpose.deploy.cli import main
 def test_growth_is_from_the_second_minute_to_the_last_by_process_and_of_all() -> None:
     minutes = [{"rss_mb": {"camera": a, "tracking": b}} for a, b in ((10, 50), (100, 100), (150, 100), (110, 120))]
     assert growth(minutes) == pytest.approx({"camera": 0.1, "tracking": 0.2, "all": 0.15})
+    assert growth([*minutes, {"rss_mb": {}}]) == growth(minutes)  # the last has hardly begun
     assert growth(minutes[:2]) is None
 
 

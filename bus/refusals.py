@@ -12,6 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 import zenoh
+from cachetools import LRUCache
 
 from fieldpose.bus.protocol import Closer, Closing
 
@@ -41,6 +42,8 @@ _REASONS = (
     ("not the right type", "it speaks no TLS"),
 )
 _PERIOD_S = 60.0
+_KEPT = 1024
+"""Kinds of refusals, for who is refused may try ever new keys."""
 
 
 class Refusals:
@@ -50,11 +53,11 @@ class Refusals:
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:
-        self.counts: dict[str, int] = {}
+        self.counts: LRUCache[str, int] = LRUCache(_KEPT)
         self._say = say
-        self._said: dict[str, float] = {}
-        self._last: dict[str, re.Match[str]] = {}
-        self._names: dict[str, str] = {}
+        self._said: LRUCache[str, float] = LRUCache(_KEPT)
+        self._last: LRUCache[str, re.Match[str]] = LRUCache(_KEPT)
+        self._names: LRUCache[str, str] = LRUCache(_KEPT)
 
     def took(self, line: str) -> bool:
         """Whether a line is about a refusal, or only there to find some, and so is not to be shown."""

@@ -9,34 +9,25 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import psutil
 
-from fieldpose.bus.messages import Frame, State, Truth
-from fieldpose.bus.replay import read_recording
-from fieldpose.bus.topics import FRAME, TRUTH
+from fieldpose.bus.messages import State
 from fieldpose.connection import Connection, connect
 from fieldpose.deploy.benchmarks import machine
 from fieldpose.deploy.benchmarks.sequences import Sequence as Followed
+from fieldpose.deploy.benchmarks.sequences import there_and_back
 from fieldpose.deploy.commands.run import planned
 from fieldpose.deploy.processes.pipeline import Progress, Run, run_pipelines
 from fieldpose.deploy.settings import Settings, changed
-from fieldpose.errors import RecordingError, TransportError
-from fieldpose.stages.geometry import rotation_error_deg, translation_error
+from fieldpose.errors import TransportError
+from fieldpose.stages.camera.core import CapturedFrame
 
 _JOIN_S, _LOOK_S, _MINUTE_S = 30.0, 2.0, 60.0
 _NS = 1e9
 Report = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Shot:
-    """A frame of the film that is shown over and over, and where its camera was (4, 4)."""
-
-    frame: Frame
-    cam_from_object: np.ndarray
 
 
 @dataclass
@@ -54,7 +45,7 @@ class Minute:
 def measure(followed: Followed, seconds: float, rate_hz: float, report: Report) -> dict[str, Any]:
     """Everything that `fieldpose bench endure` prints, as its JSON. Raises what a run raises."""
     settings = changed(Settings(), {"camera": {"source": "bus"}, "tracking": {"sequence": "video"}}, "bench endure")
-    watch = _Watch(_there_and_back(followed), followed, seconds, rate_hz, report)
+    watch = _Watch(there_and_back(followed.recording), followed, seconds, rate_hz, report)
     (outcome,) = run_pipelines(Run((planned(settings, followed.field),)), watch)
     watch.join()
     minutes = [_figures(minute) for minute in watch.minutes]
@@ -78,24 +69,11 @@ def growth(minutes: Sequence[dict[str, Any]]) -> dict[str, float] | None:
     return {**grown, "all": sum(last.values()) / sum(first.values()) - 1}
 
 
-def _there_and_back(followed: Followed) -> list[Shot]:
-    truths, frames = {}, []
-    for recorded in read_recording(followed.recording, (FRAME, TRUTH)):
-        if recorded.topic is TRUTH:
-            truths[recorded.message.header.frame_id] = cast(Truth, recorded.message).cam_from_object
-        else:
-            frames.append(cast(Frame, recorded.message))
-    shots = [Shot(each, pose) for each in frames if (pose := truths.get(each.header.frame_id)) is not None]
-    if not shots:
-        raise RecordingError(f"{followed.recording}: has no camera frames with true poses")
-    return shots + shots[-2:0:-1]
-
-
 class _Watch:
     """Looks at a run's progress; once it runs, shows it the film, listens, and ends it when the time is over."""
 
     def __init__(
-        self, shots: Sequence[Shot], followed: Followed, seconds: float, rate_hz: float, report: Report
+        self, shots: Sequence[CapturedFrame], followed: Followed, seconds: float, rate_hz: float, report: Report
     ) -> None:  # fmt: skip
         self.minutes: list[Minute] = []
         self._shots, self._limit, self._seconds, self._rate_hz, self._report = (
@@ -154,8 +132,8 @@ class _Watch:
         for number, shot in enumerate(cycle(self._shots)):
             if self._over.wait(max(0.0, began + number / self._rate_hz - time.monotonic())):
                 return
-            frame, now_ns = shot.frame, time.time_ns()
-            pipeline.publish(frame.image, frame.camera, now_ns, frame.encoding, number)
+            now_ns = time.time_ns()
+            pipeline.publish(shot.image, shot.camera, now_ns, shot.encoding, number)
             self._minute(now_ns).sent += 1
 
     def _listen(self, pipeline: Connection) -> None:
@@ -173,9 +151,9 @@ class _Watch:
         if not state.is_sure or state.cam_from_object is None:
             return
         minute.sure += 1
-        truth = self._shots[header.frame_id % len(self._shots)].cam_from_object
-        turn, shift = rotation_error_deg(state.cam_from_object, truth), translation_error(state.cam_from_object, truth)
-        minute.wrong += turn > self._limit.angle_deg or shift > self._limit.distance
+        truth = self._shots[header.frame_id % len(self._shots)].truth
+        if truth is not None and truth.cam_from_object is not None:
+            minute.wrong += not self._limit.holds(truth.cam_from_object, state.cam_from_object)
 
     def _minute(self, at_ns: int) -> Minute:
         number = max(0, int((at_ns - self._began_ns) / _NS / _MINUTE_S))

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import psutil
 from numba import njit
 from threadpoolctl import threadpool_limits
 
@@ -117,3 +118,9 @@ def _sum_of_reads(table: np.ndarray, places: np.ndarray) -> float:
     for i in range(places.shape[0]):
         total += table[places[np.uint64(i)]]
     return total
+
+
+def cpu_s(process: psutil.Process) -> float:
+    """Seconds of processor time that a process has used."""
+    times = process.cpu_times()
+    return float(times.user + times.system)

@@ -23,6 +23,7 @@ from fieldpose.bus.topics import Address, topic_of
 from fieldpose.bus.transport import wait_for
 from fieldpose.deploy.benchmarks import echo, machine
 from fieldpose.deploy.benchmarks.load import SENDER, Sent
+from fieldpose.deploy.processes.forking import FIELDPOSE
 from fieldpose.deploy.processes.lifeline import PARENT
 from fieldpose.deploy.recording_options import recorded_files
 from fieldpose.errors import ProcessError, RecordingError
@@ -49,10 +50,10 @@ def measure(
         with _process("stage", NAME, "--record", record, "--record.split", split, "--connect", hub) as recorder:
             _wait_for_recorder(hub, recorder)
             watched = psutil.Process(recorder.pid)
-            cpu_s, began = _cpu_s(watched), time.monotonic()
+            cpu_s, began = machine.cpu_s(watched), time.monotonic()
             before_mb = watched.memory_info().rss / 2**20
             sent, rss_mb = _send(hub, (seconds, rate_hz, *size), watched, account, report)
-            cpu_s, wall_s = _cpu_s(watched) - cpu_s, time.monotonic() - began
+            cpu_s, wall_s = machine.cpu_s(watched) - cpu_s, time.monotonic() - began
             highest_mb = _highest_mb(recorder.pid)
             recorder.terminate()
             _, errors = recorder.communicate(timeout=_END_S)
@@ -134,7 +135,7 @@ def _wait_for_recorder(hub: str, recorder: subprocess.Popen[bytes]) -> None:
 
 
 def _process(*arguments: object) -> Any:
-    return _started([sys.executable, "-P", "-m", "fieldpose", *map(str, arguments)])
+    return _started([*FIELDPOSE, *map(str, arguments)])
 
 
 @contextmanager
@@ -147,11 +148,6 @@ def _started(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
         finally:
             if process.poll() is None:
                 process.kill()
-
-
-def _cpu_s(process: psutil.Process) -> float:
-    times = process.cpu_times()
-    return float(times.user + times.system)
 
 
 def _highest_mb(pid: int) -> float | None:

@@ -25,7 +25,9 @@ from fieldpose.deploy.benchmarks import machine
 from fieldpose.deploy.benchmarks.scale_player import Part, Told
 from fieldpose.deploy.graph import GRAPH, OBSERVER, RECORDER, Process
 from fieldpose.deploy.processes.endpoints import free_port
+from fieldpose.deploy.processes.forking import FIELDPOSE
 from fieldpose.deploy.processes.lifeline import PARENT
+from fieldpose.deploy.processes.sessions import end
 
 _PLAY = "import sys; from fieldpose.deploy.benchmarks.scale_player import play; play(sys.argv[1])"
 _READY_S, _END_S, _MORE_S = 60.0, 30.0, 10.0
@@ -75,9 +77,7 @@ def _measured(recording: Path, count: int, seconds: float, flowing: dict[str, Fl
     names = tuple(f"camera{number}" for number in range(count))
     with ExitStack() as closing:
         hub = f"tcp/127.0.0.1:{free_port()}"
-        serving = closing.enter_context(
-            _ended([sys.executable, "-P", "-m", "fieldpose", "stage", "hub", "--listen", hub, "--open"])
-        )
+        serving = closing.enter_context(_ended([*FIELDPOSE, "stage", "hub", "--listen", hub, "--open"]))
         bus = ZenohBus(hub)
         closing.callback(bus.close)
         bus.wait_for_hub(_READY_S)
@@ -88,14 +88,14 @@ def _measured(recording: Path, count: int, seconds: float, flowing: dict[str, Fl
         wanted = [f"object/{camera}/{part.process}" for part in parts for camera in part.cameras]
         wait_for(bus, Address(camera=names[0]), wanted, _READY_S)
         hub_process = psutil.Process(serving.pid)
-        before, hub_before = _stats(inbox), _cpu_s(hub_process)
+        before, hub_before = _stats(inbox), machine.cpu_s(hub_process)
         began = time.monotonic()
         bus.hold(Address(camera=names[0]).live(OBSERVER))
         told = [
             msgspec.json.decode(process.communicate(timeout=seconds + _MORE_S + _END_S)[0], type=Told)
             for process in running
         ]
-        passed, hub_cpu = time.monotonic() - began, _cpu_s(hub_process) - hub_before
+        passed, hub_cpu = time.monotonic() - began, machine.cpu_s(hub_process) - hub_before
         return _figures(parts, told, before, _stats(inbox), passed, flowing, count) | {
             "hub_cpu": hub_cpu / passed, "hub_rss_mb": hub_process.memory_info().rss / 2**20,
         }  # fmt: skip
@@ -153,11 +153,6 @@ def _json(part: Part) -> str:
     return msgspec.json.encode(part).decode()
 
 
-def _cpu_s(process: psutil.Process) -> float:
-    times = process.cpu_times()
-    return float(times.user + times.system)
-
-
 @contextmanager
 def _ended(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
     environment = {**os.environ, PARENT: str(os.getpid()), "OMP_NUM_THREADS": "1"}
@@ -165,9 +160,4 @@ def _ended(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
     try:
         yield process
     finally:
-        process.terminate()
-        try:
-            process.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        end(process, _END_S)

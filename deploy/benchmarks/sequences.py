@@ -10,6 +10,9 @@ from fieldpose.deploy.benchmarks.fields import kept_field
 from fieldpose.deploy.learning import learn_field
 from fieldpose.deploy.scene import demo_file
 from fieldpose.errors import UsageError
+from fieldpose.stages.camera.config import CameraConfig
+from fieldpose.stages.camera.core import CapturedFrame
+from fieldpose.stages.camera.sources import open_source
 from fieldpose.stages.geometry import Limit
 from fieldpose.stages.nerf.config import FieldConfig, TrainingConfig
 
@@ -63,6 +66,12 @@ def found(names: tuple[str, ...], fields: Fields, report: Callable[[str], None])
 def demo() -> Sequence:
     """The sequence of the demo scene. Raises FieldposeError where fieldpose was installed without it."""
     return Sequence(DEMO, demo_file("sequence.mcap"), demo_file("field.safetensors"), _DEMO_LIMIT)
+
+
+def there_and_back(recording: Path) -> list[CapturedFrame]:
+    """The frames of a recording, and back again without its ends, so that they can follow one another for ever."""
+    frames = list(open_source(CameraConfig(f"mcap:{recording}")).frames(0))
+    return frames + frames[-2:0:-1]
 
 
 def _sequence(name: str, fields: Fields, report: Callable[[str], None]) -> Sequence:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import secrets
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
-_FIELDPOSE = (sys.executable, "-P", "-m", "fieldpose")
+from fieldpose.deploy.processes.forking import FIELDPOSE
+
 _END_S = 20.0
 
 
@@ -34,7 +34,7 @@ class TwoHosts:
     @contextmanager
     def started(self, host: str, *arguments: object) -> Iterator[subprocess.Popen[str]]:
         """`fieldpose` with these arguments on one of them; ended by Ctrl-C, and killed where that does not help."""
-        command = ["ip", "netns", "exec", host, *_FIELDPOSE, *map(str, arguments)]
+        command = ["ip", "netns", "exec", host, *FIELDPOSE, *map(str, arguments)]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         try:
             yield process

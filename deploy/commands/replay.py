@@ -108,6 +108,8 @@ class Options:
                 raise UsageError(f"--{name} is for a replay of processes, from the camera, and not for {why}")
         if self.rate is not None and (not self.rate > 0 or self.pace not in (None, "live")):
             raise UsageError(f"--rate {self.rate:g} with --pace {self.pace or 'live'}: expected a rate above 0, live")
+        if self.check != "close" and self.closeness != Closeness():
+            raise UsageError("--close. tells how near is near enough for --check close; give that too")
         if not self.start >= 0:
             raise UsageError(f"--start {self.start:g}: expected seconds from 0 on")
 

@@ -6,13 +6,11 @@ from typing import Any
 
 from fieldpose.bus.access import AUTHORITY
 from fieldpose.deploy.graph import CAMERA
-from fieldpose.deploy.hosts.services import CACHE, CONFIG, FIELDS, PORT, STATE, Service, Site
+from fieldpose.deploy.hosts.services import CACHE, CONFIG, FIELDS, PORT, STATE, TLS, Service, Site
 from fieldpose.deploy.hosts.writing import to_yaml
 
-_TLS = "/run/fieldpose/tls"
 _HUB = f"${{FIELDPOSE_HUB:-tls/127.0.0.1:{PORT}}}"
 _USER = "${FIELDPOSE_USER:-1000:1000}"
-_MORE_S = 5
 
 
 def files(site: Site) -> dict[str, bytes]:
@@ -35,7 +33,7 @@ def files(site: Site) -> dict[str, bytes]:
 def _service(service: Service, site: Site) -> dict[str, Any]:
     made: dict[str, Any] = {
         "image": site.image,
-        "command": service.command(_HUB, _TLS, site.shared_memory),
+        "command": service.command(_HUB, TLS, site.shared_memory),
         "environment": service.environment,
         "user": _USER,
         # Peers listen on ports of their own choice, which other hosts must reach.
@@ -48,9 +46,9 @@ def _service(service: Service, site: Site) -> dict[str, Any]:
         "security_opt": ["no-new-privileges:true"],
         # A camera ends with its source; what ends with an error begins again.
         "restart": "on-failure" if service.row.name == CAMERA else "unless-stopped",
-        "stop_grace_period": f"{service.row.stop_s + _MORE_S:g}s",
+        "stop_grace_period": f"{service.stop_s:g}s",
         "deploy": {"resources": {"limits": {"memory": f"{service.memory_mb}M"}}},
-        "secrets": [{"source": name, "target": f"{_TLS}/{name}"} for name in service.certificates],
+        "secrets": [{"source": name, "target": f"{TLS}/{name}"} for name in service.certificates],
     }
     if service.device is not None:
         made["devices"] = [f"{service.device}:{service.device}"]

@@ -5,18 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from fieldpose.deploy.graph import CAMERA, HUB
-from fieldpose.deploy.hosts.services import CACHE, CONFIG, FIELDS, PORT, STATE, Service, Site
+from fieldpose.deploy.hosts.services import CACHE, CONFIG, FIELDS, PORT, STATE, TLS, Service, Site
 from fieldpose.deploy.hosts.writing import to_yaml
 from fieldpose.errors import UsageError
 
-_TLS = "/run/fieldpose/tls"
 _HUB = f"tls/{HUB}:{PORT}"
 _NAMESPACE, _CONFIG_MAP = "fieldpose", "fieldpose-config"
 _PART_OF = {"app.kubernetes.io/part-of": "fieldpose"}
 _NODE_OF_CAMERA = "fieldpose/camera"
 _USER, _VIDEO = 1000, 44
 _READ_BY_GROUP = 0o440
-_MORE_S = 5
 _FIELDS_GB, _STATE_GB = 5, 50
 
 
@@ -109,7 +107,7 @@ def _pod(service: Service, site: Site) -> dict[str, Any]:
         **({"nodeSelector": {_NODE_OF_CAMERA: service.name}} if tied else {}),
         "automountServiceAccountToken": False,
         "enableServiceLinks": False,
-        "terminationGracePeriodSeconds": round(service.row.stop_s + _MORE_S),
+        "terminationGracePeriodSeconds": round(service.stop_s),
         "securityContext": {
             "runAsNonRoot": True, "runAsUser": _USER, "runAsGroup": _USER, "fsGroup": _USER, **groups,
             "seccompProfile": {"type": "RuntimeDefault"},
@@ -117,7 +115,7 @@ def _pod(service: Service, site: Site) -> dict[str, Any]:
         "containers": [{
             "name": service.row.name,
             "image": site.image,
-            "args": service.command(_HUB, _TLS, shared_memory=False),
+            "args": service.command(_HUB, TLS, shared_memory=False),
             "env": [{"name": name, "value": value} for name, value in service.environment.items()],
             **({"ports": [{"name": "zenoh", "containerPort": PORT}]} if service.row.name == HUB else {}),
             "resources": {
@@ -142,7 +140,7 @@ def _context(service: Service) -> dict[str, Any]:
 def _volumes(service: Service) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """What a pod has, and where its container has it."""
     those: list[tuple[str, dict[str, Any], str, bool]] = [
-        ("tls", {"secret": {"secretName": _secret(service.row.name), "defaultMode": _READ_BY_GROUP}}, _TLS, True),
+        ("tls", {"secret": {"secretName": _secret(service.row.name), "defaultMode": _READ_BY_GROUP}}, TLS, True),
         ("tmp", {"emptyDir": {}}, "/tmp", False),
     ]
     if service.row.make is not None:

@@ -20,11 +20,14 @@ from fieldpose.errors import UsageError
 
 CONFIG, FIELDS, STATE, CACHE = "/etc/fieldpose", "/srv/fieldpose/fields", "/var/lib/fieldpose", "/var/cache/fieldpose"
 """Where a host or a container has settings and calibrations, fields, what is written, and compiled kernels."""
+TLS = "/run/fieldpose/tls"
+"""Where a container has the certificate and the key of its role."""
 PORT = 7447
 EVERYWHERE = f"tls/0.0.0.0:{PORT}"
 _NOT_IN_NAMES = re.compile(r"[^a-z0-9]+")
 _MEMORY_MB = 2048
 """Far above what a process uses, for a limit is to save the host from one that has gone wrong."""
+_MORE_S = 5.0
 _SOURCES_OF_FILES = ("folder", "dataset", "video", "mcap", "bag")
 
 
@@ -59,6 +62,11 @@ class Service:
     def certificates(self) -> tuple[str, ...]:
         """The files of a folder of certificates that it needs: its own role's, and no others."""
         return AUTHORITY, f"{self.row.name}.pem", f"{self.row.name}.key"
+
+    @property
+    def stop_s(self) -> float:
+        """How long it may take to end before it is killed."""
+        return self.row.stop_s + _MORE_S
 
     @property
     def memory_mb(self) -> int:

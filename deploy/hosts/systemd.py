@@ -8,7 +8,6 @@ from fieldpose.deploy.hosts.services import CACHE, FIELDS, PORT, STATE, Service,
 _CERTIFICATES = f"{STATE}/certs"
 _HUB = "${FIELDPOSE_HUB}"
 TARGET = "fieldpose.target"
-_MORE_S = 5
 _HARDENING = """NoNewPrivileges=yes
 CapabilityBoundingSet=
 AmbientCapabilities=
@@ -73,7 +72,7 @@ ExecStart={command}
 Restart=on-failure
 RestartSec=1
 RestartPreventExitStatus=2
-TimeoutStopSec={service.row.stop_s + _MORE_S:g}
+TimeoutStopSec={service.stop_s:g}
 MemoryMax={service.memory_mb}M
 User=fieldpose
 {_given(service)}

@@ -1,14 +1,26 @@
-"""What is left of a session of processes whose leader is gone."""
+"""Ending a process, and what is left of a session of processes whose leader is gone."""
 
 from __future__ import annotations
 
 import os
+import subprocess
 import time
 from contextlib import suppress
+from typing import Any
 
 import psutil
 
 _POLL_S = 0.02
+
+
+def end(process: subprocess.Popen[Any], patience_s: float) -> None:
+    """Ask a process to end, and see to it. Returns once it is gone."""
+    process.terminate()
+    try:
+        process.wait(patience_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def end_session(leader: int, patience_s: float) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from fieldpose.deploy.access.joining import Entry
 from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.processes.endpoints import free_port, with_scheme
+from fieldpose.deploy.processes.forking import FIELDPOSE
+from fieldpose.deploy.processes.sessions import end
 from fieldpose.errors import UsageError
 
 _END_S = 10.0
@@ -38,15 +39,8 @@ def page_beside(plans: tuple[Plan, ...], listen: str | None, wanted: bool, entry
     else:
         # By TLS it waits for the keys, which the run makes.
         reached, entering = with_scheme(reached, "tls"), [] if entry.tls is None else ["--tls", str(entry.tls)]
-    viewer = subprocess.Popen(
-        [sys.executable, "-P", "-m", "fieldpose", "view", str(plan.field), "--connect", reached, *entering, *parts]
-    )
+    viewer = subprocess.Popen([*FIELDPOSE, "view", str(plan.field), "--connect", reached, *entering, *parts])
     try:
         yield hub
     finally:
-        viewer.terminate()
-        try:
-            viewer.wait(_END_S)
-        except subprocess.TimeoutExpired:
-            viewer.kill()
-            viewer.wait()
+        end(viewer, _END_S)

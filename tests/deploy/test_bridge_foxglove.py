@@ -20,7 +20,7 @@ from websockets.sync.client import connect
 
 from fieldpose.bus.ports import Outbox
 from fieldpose.bus.topics import CORRESPONDENCES, FRAME, STATE, Address
-from fieldpose.bus.transport import ZenohBus, serve_hub
+from fieldpose.bus.transport import ZenohBus
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.foxglove import channels
 from fieldpose.deploy.foxglove.converter import Converted
@@ -31,16 +31,6 @@ from fieldpose.errors import TransportError
 
 ENOUGH_S = 60.0
 ADDRESS = Address("fieldpose", "mug", "cam")
-
-
-@pytest.fixture
-def hub() -> Iterator[str]:
-    stop, address = threading.Event(), f"tcp/127.0.0.1:{free_port()}"
-    serving = threading.Thread(target=serve_hub, args=(address, None, stop))
-    serving.start()
-    yield address
-    stop.set()
-    serving.join()
 
 
 @contextmanager

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-import threading
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,7 @@ from fieldpose.bus.recovery import recover
 from fieldpose.bus.replay import info
 from fieldpose.bus.splitting import Split
 from fieldpose.bus.topics import ALL, STATE, Address
-from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus, serve_hub
+from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.foxglove.recording import FoxgloveRecording
 from fieldpose.deploy.processes.endpoints import free_port
@@ -171,16 +169,6 @@ def test_a_killed_recording_in_foxgloves_form_is_recovered_and_gone_on_from(tmp_
     assert len(read_mcap(path)["/camera/image"]) == 5
     assert not info(path).lossless
     assert set(tmp_path.iterdir()) == {path, tmp_path / "saved.mcap"}
-
-
-@pytest.fixture
-def hub() -> Iterator[str]:
-    stop, address = threading.Event(), f"tcp/127.0.0.1:{free_port()}"
-    serving = threading.Thread(target=serve_hub, args=(address, None, stop))
-    serving.start()
-    yield address
-    stop.set()
-    serving.join()
 
 
 def test_a_recorder_is_asked_for_what_came_last(hub: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

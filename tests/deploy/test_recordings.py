@@ -13,21 +13,11 @@ from support import bus_samples
 from fieldpose.bus.ports import Outbox
 from fieldpose.bus.replay import info
 from fieldpose.bus.topics import POSE, STATE, Address
-from fieldpose.bus.transport import ZenohBus, serve_hub
+from fieldpose.bus.transport import ZenohBus
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.processes.endpoints import free_port
 
 ADDRESS = Address("fieldpose", "mug", "cam")
-
-
-@pytest.fixture
-def hub() -> Iterator[str]:
-    stop, address = threading.Event(), f"tcp/127.0.0.1:{free_port()}"
-    serving = threading.Thread(target=serve_hub, args=(address, None, stop))
-    serving.start()
-    yield address
-    stop.set()
-    serving.join()
 
 
 @pytest.fixture

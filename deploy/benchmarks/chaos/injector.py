@@ -63,7 +63,7 @@ class Injector:
         elif self._left and self._ready(now):
             self._look_around(progress)
             self._bring_about(self._left.pop(0), progress)
-        elif not self._left and now - self._gone_at > self._settled_s and not self.stopped:
+        elif not self._left and self._is_over(progress, now) and not self.stopped:
             self._look_around(progress)
             self.stopped = True
             signal.raise_signal(signal.SIGINT)
@@ -87,6 +87,16 @@ class Injector:
         settled = not self.done or now - self._gone_at > self._settled_s
         wait_s = self._left[0].wait_s + (_WELL_S if self.done else 0.0)
         return settled and self._well_since is not None and now - self._well_since > wait_s
+
+    def _is_over(self, progress: Progress, now: float) -> bool:
+        """Whether the last event has been settled, and who was hit has a successor, by which a fault is noticed."""
+        if now - self._gone_at <= self._settled_s:
+            return False
+        last = self.done[-1] if self.done else None
+        if last is None or last.event.kind is Kind.PAUSE or last.event.process == SUPERVISOR:
+            return True
+        replaced = progress.pids.get(last.event.process, last.pid) != last.pid
+        return replaced or now - self._gone_at > _PATIENCE_S
 
     def _bring_about(self, event: Event, progress: Progress) -> None:
         pid = _supervisor() if event.process == SUPERVISOR else progress.pids.get(event.process, 0)

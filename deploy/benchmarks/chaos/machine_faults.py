@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -26,10 +25,10 @@ from fieldpose.deploy.benchmarks.chaos.judging import Verdict, Wrong, back_s
 from fieldpose.deploy.benchmarks.chaos.rounds import Played
 from fieldpose.deploy.benchmarks.sequences import Sequence as Followed
 from fieldpose.deploy.benchmarks.two_hosts import two_hosts
+from fieldpose.deploy.processes.forking import FIELDPOSE
 from fieldpose.deploy.reporting.results import FrameResult
 from fieldpose.errors import FieldposeError
 
-_FIELDPOSE = (sys.executable, "-P", "-m", "fieldpose")
 _DISK_MB = 36
 """Of which a recorder keeps 16 free for the end of its file."""
 _DISK_FRAMES = 300
@@ -123,7 +122,7 @@ def _small_disk() -> Iterator[Path]:
 
 
 def _command(*arguments: object) -> list[str]:
-    return [*_FIELDPOSE, *map(str, arguments)]
+    return [*FIELDPOSE, *map(str, arguments)]
 
 
 def _wait_for_line(process: subprocess.Popen[str], end: str) -> None:

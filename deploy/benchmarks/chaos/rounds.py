@@ -15,6 +15,7 @@ from fieldpose.deploy.benchmarks.chaos.events import Event, Kind, Round
 from fieldpose.deploy.benchmarks.chaos.injector import SETTLED_S, Injector
 from fieldpose.deploy.benchmarks.chaos.judging import Verdict, Wrong, back_s, judged, wrong
 from fieldpose.deploy.benchmarks.sequences import Sequence as Followed
+from fieldpose.deploy.benchmarks.sequences import there_and_back
 from fieldpose.deploy.commands.run import planned
 from fieldpose.deploy.evaluation.film import FrameLog
 from fieldpose.deploy.plan import Plan
@@ -23,7 +24,6 @@ from fieldpose.deploy.reporting.results import RunResult
 from fieldpose.deploy.settings import Settings
 from fieldpose.errors import ProcessError
 from fieldpose.stages.camera.config import CameraConfig
-from fieldpose.stages.camera.sources import open_source
 
 _RATE_HZ = 30.0
 
@@ -42,8 +42,7 @@ class Played:
 
 def film(path: Path, recording: Path, seconds: float) -> Path:
     """A recording of so many seconds with the frames of another and their true poses, there and back again."""
-    frames = list(open_source(CameraConfig(f"mcap:{recording}")).frames(0))
-    lap = frames + frames[-2:0:-1]
+    lap = there_and_back(recording)
     writer = RecordingWriter(path)
     log = FrameLog(writer)
     for i in range(round(seconds * _RATE_HZ)):

@@ -166,6 +166,8 @@ def test_step_by_step_each_message_is_shown_and_q_ends(
         (["--rate", "0"], "expected a rate above 0"),
         (["--rate", "2", "--pace", "lockstep"], "with --pace lockstep"),
         (["--start", "-1"], "expected seconds from 0 on"),
+        (["--close.share", "0.9"], "give that too"),
+        (["--check", "exact", "--close.within", "0.1"], "give that too"),
         (["--from", "guess", "--field", "FIELD"], "has no guess of object/camera0 to begin with"),
         (["--from", "guess", "--field", "FIELD", "--start", "3"], "from that time on"),
     ],

@@ -16,6 +16,7 @@ from fieldpose.stages.geometry import Camera
 
 _BURST = 8
 _DEFAULT_RATE_HZ = 30.0
+_HELD_UP_NS = 10**9
 Clock = Literal["none", "own", "wall"]
 
 
@@ -94,9 +95,13 @@ class Feed:
         self._in_flight: dict[str | None, int] = {}
         self._last_sign_ns = 0
         self.unanswered = 0
+        self.held_up_ns = 0
 
     def due(self, now_ns: int) -> Iterator[tuple[CapturedFrame, int]]:
         """Frames to send now, each with its capture time since the epoch; a device is waited for.
+
+        Live ones that are more than a second late, as after the machine was suspended, move all that follow.
+        `held_up_ns` is how far.
 
         Raises what the source raises where it cannot be read on.
         """
@@ -105,14 +110,18 @@ class Feed:
             if frame is None:
                 return
             capture_ns = self._capture_ns(frame, now_ns)
-            if self._pace == "live" and self._clock != "wall" and capture_ns > now_ns:
-                return
+            if self._plays:
+                if capture_ns > now_ns:
+                    return
+                if now_ns - capture_ns > _HELD_UP_NS:
+                    self._go_on_from(now_ns, capture_ns)
+                    capture_ns = now_ns
             self._note_sent(frame, now_ns)
             yield frame, capture_ns
 
     def wait_s(self, now_ns: int) -> float | None:
         """How long until the next frame is due; None where that is not known (yet)."""
-        if self._next is None or self._pace != "live" or self._clock == "wall" or self._start is None:
+        if self._next is None or not self._plays or self._start is None:
             return None
         return max(self._capture_ns(self._next, now_ns) - now_ns, 0) * 1e-9
 
@@ -141,6 +150,17 @@ class Feed:
         close = getattr(self._frames, "close", None)
         if close is not None:
             close()
+
+    @property
+    def _plays(self) -> bool:
+        """Whether it gives frames that are there already as a camera would."""
+        return self._pace == "live" and self._clock != "wall"
+
+    def _go_on_from(self, now_ns: int, capture_ns: int) -> None:
+        """After a pause of the machine or the process: a camera does not make up for it by frames in a rush."""
+        if self._start is not None:
+            self.held_up_ns += now_ns - capture_ns
+            self._start = (self._start[0] + now_ns - capture_ns, self._start[1])
 
     def _may_send(self, now_ns: int) -> bool:
         if self._pace != "lockstep" or self._awaited is None:

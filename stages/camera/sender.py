@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.messages import Message, State
 from fieldpose.bus.node import Output
 from fieldpose.errors import FieldposeError, SourceError
@@ -24,6 +25,7 @@ class Sender:
         self._progress = Progress(config.progress_file, config.source)
         self._feed = Feed(source, config, self._progress.next)
         self._error: FieldposeError | None = None
+        self._held_up_ns = 0
 
     def messages(self, now_ns: int) -> Iterator[Output]:
         """What is to be sent now; progress is noted after each frame."""
@@ -31,6 +33,10 @@ class Sender:
             for frame, capture_ns in self._feed.due(now_ns):
                 yield from messages_of(frame, capture_ns)
                 self._progress.advance()
+            if self._feed.held_up_ns > self._held_up_ns:
+                by_s = round((self._feed.held_up_ns - self._held_up_ns) * 1e-9, 1)
+                stage_logger("camera").warning("frames were due earlier and go on from here", seconds=by_s)
+                self._held_up_ns = self._feed.held_up_ns
         except (FieldposeError, OSError) as error:
             self._error = error if isinstance(error, FieldposeError) else SourceError(str(error))
 

@@ -113,15 +113,15 @@ def main(hub: str, seconds: float) -> None:
     attacks = stranger.attacks()
     for name, attack in attacks.items():
         end, n = time.monotonic() + seconds / (len(attacks) + 1), 0
-        while time.monotonic() < end:
+        while n == 0 or time.monotonic() < end:
             for topic, payload in attack(n):
-                if time.monotonic() > end:
+                if n > 0 and time.monotonic() > end:
                     break
                 bus.put(ADDRESS.key(topic, "pnp"), payload, topic)
                 sent[name] += 1
             n += 1
     end = time.monotonic() + seconds / (len(attacks) + 1)
-    while time.monotonic() < end:
+    while not sent["greetings"] or time.monotonic() < end:
         sent["greetings"] += 1
         word = b'{"held":["fieldpose/live/object/camera0/pnp"],"changes":%d,"number":%d,"to":""}'
         bus.put(f"peers/stranger{sent['greetings'] % 999}", word % (2**60, sent["greetings"]))

@@ -48,6 +48,24 @@ def test_live_frames_go_when_their_own_times_say_so() -> None:
     assert sent(live, 1000) == [(3, 200), (4, 233)]
 
 
+def test_after_a_pause_live_frames_go_on_at_their_pace_and_not_in_a_rush() -> None:
+    late = feed("own")
+    sent(late, 0)
+    assert sent(late, 1000) == [(1, 33), (2, 67), (3, 200), (4, 233)]
+    assert late.held_up_ns == 0
+    halted = feed("own")
+    sent(halted, 0)
+    assert sent(halted, 5000) == [(1, 5000)]
+    assert sent(halted, 5033) == []
+    assert sent(halted, 5034) == [(2, 5034)]
+    assert halted.held_up_ns == (5000 - 33) * MS
+    in_step = feed("own", pace="lockstep")
+    sent(in_step, 0)
+    in_step.answered(0, 0, 0)
+    sent(in_step, 5000)
+    assert in_step.held_up_ns == 0
+
+
 def test_every_other_frame_goes_at_its_own_time_and_a_second_start_goes_on_there() -> None:
     every_other = feed("own", every=2)
     assert sent(every_other, 0) == [(0, 0)]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from itertools import islice
 from typing import cast
 
 import numpy as np
@@ -33,7 +32,7 @@ def open_recording(rest: str, config: CameraConfig, calibrator: Calibrator) -> S
     _refuse_others(rest)
 
     def frames(first: int) -> Iterator[CapturedFrame]:
-        return islice(_frames(rest, config.size, wanted), first, None)
+        return _frames(rest, config.size, wanted, first)
 
     if next(frames(0), None) is None:
         which = "" if config.recorded is None else f" of {config.recorded}"
@@ -59,15 +58,19 @@ def _address(recorded: str) -> Address:
     return Address("*", object, camera)
 
 
-def _frames(path: str, size: int | None, wanted: Address | None) -> Iterator[CapturedFrame]:
-    """Frames whose number has been there before, as all have that a sender did not count, are numbered on."""
+def _frames(path: str, size: int | None, wanted: Address | None, first: int) -> Iterator[CapturedFrame]:
+    """From the frame at that place on; those whose number has been there before, as all have that a sender did not
+    count, are numbered on.
+    """
     numbers: set[int] = set()
     largest = 0
-    for frame, truth in _with_truths(path, wanted):
+    for place, (frame, truth) in enumerate(_with_truths(path, wanted)):
         camera, header = frame.camera, frame.header
         number = header.frame_id if header.frame_id not in numbers else largest + 1
         numbers.add(number)
         largest = max(largest, number)
+        if place < first:
+            continue
         known = None if truth is None else TruePose(truth.cam_from_object)
         image, encoding = frame.image, frame.encoding
         if size is not None and max(camera.width, camera.height) > size:

@@ -13,8 +13,9 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
+from fieldpose.bus.mcap_files import RECORDING_RECORD
 from fieldpose.bus.open_recording import OpenRecording
-from fieldpose.bus.replay import RECORDING_RECORD, Salvage
+from fieldpose.bus.salvage import Salvage
 from fieldpose.errors import OutputError
 
 _OWN_PROFILE = "fieldpose"

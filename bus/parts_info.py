@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from fieldpose.bus.replay import RecordingInfo, SourceInfo, TopicInfo
+from fieldpose.bus.reading import RecordingInfo, SourceInfo, TopicInfo
 
 
 def joined(parts: Sequence[RecordingInfo]) -> RecordingInfo | None:

@@ -12,10 +12,11 @@ import msgspec
 from mcap.writer import CompressionType
 
 from fieldpose.bus.codec import decode, encode
+from fieldpose.bus.mcap_files import RECORDING_RECORD, SOURCE_RECORD, Attachment
 from fieldpose.bus.messages import Header, Message
 from fieldpose.bus.open_recording import OpenRecording, set_aside
 from fieldpose.bus.ports import Sequences
-from fieldpose.bus.replay import RECORDING_RECORD, SOURCE_RECORD, Attachment, Salvage
+from fieldpose.bus.salvage import Salvage
 from fieldpose.bus.senders import KEPT
 from fieldpose.bus.topics import Topic, topic_of
 from fieldpose.errors import CodecError, RecordingError

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from fieldpose.bus.foreign import ForeignRecording
+from fieldpose.bus.mcap_files import RECORDING_RECORD, SOURCE_RECORD
 from fieldpose.bus.recording import RecordingWriter
-from fieldpose.bus.replay import RECORDING_RECORD, SOURCE_RECORD, Salvage
+from fieldpose.bus.salvage import Salvage
 from fieldpose.bus.topics import topic_of
 from fieldpose.errors import RecordingError
 

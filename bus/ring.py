@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 from fieldpose.bus.codec import decode
 from fieldpose.bus.logs import stage_logger
+from fieldpose.bus.mcap_files import SNAPSHOT_RECORD, Attachment
 from fieldpose.bus.messages import TrackingState
 from fieldpose.bus.open_recording import partial_path
 from fieldpose.bus.recording import Metadata, RecordingWriter
-from fieldpose.bus.replay import SNAPSHOT_RECORD, Attachment
 from fieldpose.bus.requests import SnapshotSaved
 from fieldpose.bus.topics import STATE, Topic
 from fieldpose.errors import CodecError, FieldposeError, RecordingError, RefusedError

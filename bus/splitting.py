@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from fieldpose.bus.mcap_files import EXPECTED_RECORD, PART_RECORD, Attachment
 from fieldpose.bus.messages import Header
 from fieldpose.bus.open_recording import partial_path
 from fieldpose.bus.recording import Metadata, RecordingWriter
-from fieldpose.bus.replay import EXPECTED_RECORD, PART_RECORD, Attachment, Salvage
+from fieldpose.bus.salvage import Salvage
 from fieldpose.bus.topics import Topic
 from fieldpose.errors import RecordingError
 

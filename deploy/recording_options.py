@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from fieldpose.bus.mcap_files import Attachment
 from fieldpose.bus.open_recording import check_new, partial_path
 from fieldpose.bus.recorder import Store
 from fieldpose.bus.recording import Metadata
-from fieldpose.bus.replay import Attachment
 from fieldpose.bus.requests import MOST_SNAPSHOT_S
 from fieldpose.bus.ring import SnapshotConfig, Snapshots
 from fieldpose.bus.splitting import OpenPart, Split, SplitWriter, native_parts, part_path, parts_of

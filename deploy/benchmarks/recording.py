@@ -17,8 +17,8 @@ from typing import Any
 import msgspec
 import psutil
 
+from fieldpose.bus.reading import SourceInfo, sources_in
 from fieldpose.bus.recorder import NAME
-from fieldpose.bus.replay import SourceInfo, sources_in
 from fieldpose.bus.topics import Address, topic_of
 from fieldpose.bus.transport import wait_for
 from fieldpose.deploy.benchmarks import echo, machine

@@ -18,7 +18,7 @@ import psutil
 from fieldpose.bus.codec import encode
 from fieldpose.bus.messages import Stats
 from fieldpose.bus.ports import Inbox
-from fieldpose.bus.replay import read_recording
+from fieldpose.bus.reading import read_recording
 from fieldpose.bus.topics import ALL, STATS, Address
 from fieldpose.bus.transport import ZenohBus, wait_for
 from fieldpose.deploy.benchmarks import machine

@@ -18,7 +18,7 @@ import numpy as np
 from fieldpose.bus.handlers import EndOfInput, Output
 from fieldpose.bus.messages import Message
 from fieldpose.bus.node import run_nodes
-from fieldpose.bus.replay import read_recording
+from fieldpose.bus.reading import read_recording
 from fieldpose.bus.topics import Address, Topic
 from fieldpose.bus.transport import LOCAL_HUB, ZenohBus
 from fieldpose.deploy.graph import BY_NAME, OBSERVER

@@ -12,7 +12,7 @@ from typing import Annotated
 import tyro
 from rich.progress import Progress
 
-from fieldpose.bus.replay import info
+from fieldpose.bus.reading import info
 from fieldpose.deploy.access.joining import NO_ENTRY
 from fieldpose.deploy.commands.run import INTERRUPTED, check_recorded, draw, planned
 from fieldpose.deploy.processes.pipeline import Run, run_pipelines

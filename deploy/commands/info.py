@@ -12,8 +12,9 @@ from typing import cast
 import tyro
 from rich.table import Table
 
+from fieldpose.bus.mcap_files import PART_RECORD, RECORDING_RECORD, SNAPSHOT_RECORD
 from fieldpose.bus.messages import CameraInfo
-from fieldpose.bus.replay import PART_RECORD, RECORDING_RECORD, SNAPSHOT_RECORD, RecordingInfo, info, read_recording
+from fieldpose.bus.reading import RecordingInfo, info, read_recording
 from fieldpose.bus.topics import CAMERA_INFO
 from fieldpose.deploy.reporting.output import result_console, write_json
 from fieldpose.deploy.reporting.provenance import EDIT_RECORD, PLAN_RECORD, RUN_RECORD

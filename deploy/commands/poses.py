@@ -9,7 +9,7 @@ from pathlib import Path
 
 import tyro
 
-from fieldpose.bus.replay import info
+from fieldpose.bus.reading import info
 from fieldpose.deploy.reporting.gathering import recorded_results
 from fieldpose.deploy.reporting.output import check_writable, write_bytes
 from fieldpose.deploy.reporting.provenance import pipelines_in, recorded_field

@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 
 from fieldpose.bus.messages import State
-from fieldpose.bus.replay import RecordingInfo, info, read_recording
+from fieldpose.bus.reading import RecordingInfo, info, read_recording
 from fieldpose.bus.topics import STATE, Address
 from fieldpose.deploy.commands.run import INTERRUPTED, check_recorded, planned
 from fieldpose.deploy.graph import GRAPH, threads_of

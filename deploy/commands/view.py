@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import psutil
 import tyro
 
-from fieldpose.bus.replay import RecordingInfo, info
+from fieldpose.bus.reading import RecordingInfo, info
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address
 from fieldpose.bus.transport import LOCAL_HUB

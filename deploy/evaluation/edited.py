@@ -12,9 +12,10 @@ import cv2
 import msgspec
 import numpy as np
 
+from fieldpose.bus.mcap_files import Attachment
 from fieldpose.bus.open_recording import partial_path
+from fieldpose.bus.reading import info, read_attachment
 from fieldpose.bus.recording import RecordingWriter
-from fieldpose.bus.replay import Attachment, info, read_attachment
 from fieldpose.deploy.evaluation.edits import edit_of, parameters_of
 from fieldpose.deploy.evaluation.film import FrameLog
 from fieldpose.deploy.evaluation.shots import NS_PER_S, Shot, shots_of

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from fieldpose.bus.foreign import ForeignWriter
-from fieldpose.bus.replay import read_recording
+from fieldpose.bus.reading import read_recording
 from fieldpose.bus.topics import CAMERA_INFO, FRAME, Address
 from fieldpose.deploy.foxglove.channels import ALL
 from fieldpose.deploy.foxglove.converter import Converted, Converter, clock_behind_ns

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from fieldpose.bus.messages import Correspondences
-from fieldpose.bus.replay import read_recording
+from fieldpose.bus.reading import read_recording
 from fieldpose.bus.topics import CORRESPONDENCES, Address
 
 _FILE = Path(__file__).parent / "layout.json"

@@ -7,10 +7,11 @@ from typing import Any
 
 from fieldpose.bus.codec import decode
 from fieldpose.bus.foreign import ForeignRecording
+from fieldpose.bus.mcap_files import RECORDING_RECORD
 from fieldpose.bus.messages import Header
 from fieldpose.bus.open_recording import set_aside
 from fieldpose.bus.ports import Sequences
-from fieldpose.bus.replay import RECORDING_RECORD, Salvage
+from fieldpose.bus.salvage import Salvage
 from fieldpose.bus.splitting import OpenPart
 from fieldpose.bus.topics import Address, Topic
 from fieldpose.deploy.foxglove.channels import ALL

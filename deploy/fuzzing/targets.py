@@ -123,7 +123,7 @@ def _recordings() -> list[Target]:
         return [{_RECORDING: (folder / _RECORDING).read_bytes()}]
 
     def read(folder: Path) -> None:
-        from fieldpose.bus.replay import info, of_another_program, read_recording
+        from fieldpose.bus.reading import info, of_another_program, read_recording
 
         of_another_program(folder / _RECORDING)
         info(folder / _RECORDING)

@@ -14,7 +14,7 @@ from typing import Literal
 
 from fieldpose.bus.messages import State
 from fieldpose.bus.parts_info import joined
-from fieldpose.bus.replay import RecordingInfo, info
+from fieldpose.bus.reading import RecordingInfo, info
 from fieldpose.bus.segments import removed_orphans
 from fieldpose.bus.signals import StopSignals
 from fieldpose.bus.topics import Address, shared_address

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from fieldpose.bus.messages import Failure, Message
-from fieldpose.bus.replay import read_recording
+from fieldpose.bus.reading import read_recording
 from fieldpose.bus.topics import BY_NAME, FAILURE, FRAME, STATE, Address, Topic
 from fieldpose.deploy.graph import AT_WORK, GRAPH, Process
 from fieldpose.deploy.local import LocalPipeline, Said

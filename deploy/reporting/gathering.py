@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fieldpose.bus.messages import CameraInfo, Frame, Header, Message, Reason, State, Truth
-from fieldpose.bus.replay import RecordingInfo, info, read_recording
+from fieldpose.bus.reading import RecordingInfo, info, read_recording
 from fieldpose.bus.topics import CAMERA_INFO, FRAME, GUESS, STATE, TRUTH, Address, Topic
 from fieldpose.deploy.graph import BETWEEN_STAGES, CAMERA
 from fieldpose.deploy.reporting.results import FrameResult, Outcome, TruthKnown

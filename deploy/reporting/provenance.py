@@ -11,8 +11,9 @@ from importlib import metadata as packages
 from pathlib import Path
 
 from fieldpose.bus.logs import stage_logger
+from fieldpose.bus.mcap_files import Attachment
+from fieldpose.bus.reading import RecordingInfo, read_attachment
 from fieldpose.bus.recording import Metadata
-from fieldpose.bus.replay import Attachment, RecordingInfo, read_attachment
 from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.settings import Settings, changed, to_json, without_unknown
 from fieldpose.errors import RecordingError

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from fieldpose.bus.replay import info
+from fieldpose.bus.reading import info
 from fieldpose.bus.topics import Address
 from fieldpose.deploy.foxglove.extra import check_extra
 from fieldpose.deploy.foxglove.layouts import layout, recorded_distance

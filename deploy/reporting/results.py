@@ -42,7 +42,7 @@ from typing import Any, Literal
 import numpy as np
 
 from fieldpose.bus.messages import Stats
-from fieldpose.bus.replay import RecordingInfo
+from fieldpose.bus.reading import RecordingInfo
 from fieldpose.bus.topics import Address
 from fieldpose.deploy.graph import AT_WORK
 from fieldpose.deploy.processes.liveness import Fault

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 
 from fieldpose.bus.messages import Frame
-from fieldpose.bus.replay import read_recording
+from fieldpose.bus.reading import read_recording
 from fieldpose.bus.topics import FRAME, Address
 from fieldpose.deploy.reporting.overlay import VideoFile, captioned, overlaid, without_distortion
 from fieldpose.deploy.reporting.results import FrameResult

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fieldpose.bus.messages import CameraInfo, Correspondences, Frame, Message, State, TrackingState
-from fieldpose.bus.replay import read_recording, recorded_at
+from fieldpose.bus.reading import read_recording, recorded_at
 from fieldpose.bus.topics import CORRESPONDENCES, FOLLOWED, FRAME, STATE, Topic
 from fieldpose.deploy.reporting.gathering import recorded_pipeline
 from fieldpose.deploy.viewing.history import BY_HEADER, IN_FULL, History

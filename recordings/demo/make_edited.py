@@ -14,8 +14,9 @@ from pathlib import Path
 
 import msgspec
 
+from fieldpose.bus.mcap_files import Attachment
+from fieldpose.bus.reading import info, read_attachment, read_recording
 from fieldpose.bus.recording import RecordingWriter
-from fieldpose.bus.replay import Attachment, info, read_attachment, read_recording
 from fieldpose.bus.topics import FRAME, STATE, TRUTH, Address
 from fieldpose.deploy.commands.run import planned
 from fieldpose.deploy.evaluation.edited import EDIT_ATTACHMENT, Recipe, edit_recording

@@ -18,9 +18,9 @@ from fieldpose.bus.codec import encode
 from fieldpose.bus.messages import Header
 from fieldpose.bus.open_recording import partial_path
 from fieldpose.bus.ports import Outbox
+from fieldpose.bus.reading import info, read_recording
 from fieldpose.bus.recorder import Recorder
 from fieldpose.bus.recording import RecordingWriter
-from fieldpose.bus.replay import info, read_recording
 from fieldpose.bus.topics import FRAME, Address
 from fieldpose.bus.transport import MemoryBus
 from fieldpose.errors import RecordingError

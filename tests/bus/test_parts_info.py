@@ -9,7 +9,7 @@ from support.bus_samples import ADDRESS, every_message
 from fieldpose.bus.codec import encode
 from fieldpose.bus.messages import Header
 from fieldpose.bus.parts_info import joined
-from fieldpose.bus.replay import info, sources_in
+from fieldpose.bus.reading import info, sources_in
 from fieldpose.bus.splitting import Split, SplitWriter, native_parts, part_path
 from fieldpose.bus.topics import STATE, TRUTH
 

@@ -15,13 +15,14 @@ from mcap.reader import make_reader
 from support.bus_samples import ADDRESS, every_message, failure, frame, guess, same, truth
 
 from fieldpose.bus.codec import encode
+from fieldpose.bus.mcap_files import Attachment
 from fieldpose.bus.messages import Header
 from fieldpose.bus.open_recording import partial_path
 from fieldpose.bus.ports import Inbox, Outbox
+from fieldpose.bus.reading import info, read_recording
 from fieldpose.bus.recorder import RECORDED, Recorder, RecorderHandler
 from fieldpose.bus.recording import RecordingWriter
 from fieldpose.bus.recovery import recover
-from fieldpose.bus.replay import Attachment, info, read_recording
 from fieldpose.bus.topics import ALL, FAILURE, FRAME, GUESS, STATE, STATS, TRUTH, Address
 from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus, wait_for
 from fieldpose.errors import RecordingError

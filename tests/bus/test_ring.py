@@ -13,11 +13,12 @@ from support.bus_samples import ADDRESS, every_message, frame
 
 from fieldpose.bus.codec import encode
 from fieldpose.bus.control import ask_one
+from fieldpose.bus.mcap_files import SNAPSHOT_RECORD, Attachment
 from fieldpose.bus.messages import Header, TrackingState
 from fieldpose.bus.ports import Outbox
+from fieldpose.bus.reading import info, read_recording
 from fieldpose.bus.recorder import Recorder
 from fieldpose.bus.recording import RecordingWriter
-from fieldpose.bus.replay import SNAPSHOT_RECORD, Attachment, info, read_recording
 from fieldpose.bus.requests import SaveSnapshot, Show
 from fieldpose.bus.ring import Ring, SnapshotConfig, Snapshots
 from fieldpose.bus.topics import FRAME, STATE, Address

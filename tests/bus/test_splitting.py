@@ -9,10 +9,11 @@ import pytest
 from support.bus_samples import ADDRESS, frame
 
 from fieldpose.bus.codec import encode
+from fieldpose.bus.mcap_files import EXPECTED_RECORD, PART_RECORD, Attachment
 from fieldpose.bus.messages import Header
 from fieldpose.bus.open_recording import partial_path
+from fieldpose.bus.reading import info, read_recording
 from fieldpose.bus.recording import RecordingWriter
-from fieldpose.bus.replay import EXPECTED_RECORD, PART_RECORD, Attachment, info, read_recording
 from fieldpose.bus.splitting import Split, SplitWriter, native_parts, part_path, parts_of
 from fieldpose.bus.topics import FRAME
 from fieldpose.errors import RecordingError

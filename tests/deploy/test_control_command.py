@@ -23,7 +23,7 @@ from support.tracking_world import on_sphere, ring_of_views
 import fieldpose
 from fieldpose.bus.messages import Control, State, TrackingState
 from fieldpose.bus.node import run_node
-from fieldpose.bus.replay import info, read_recording
+from fieldpose.bus.reading import info, read_recording
 from fieldpose.bus.requests import Reset, SetGuess, SetSolving, Show, TakeKeyframe
 from fieldpose.bus.topics import CONTROL, Address
 from fieldpose.bus.transport import ZenohBus, serve_hub, wait_for

@@ -11,8 +11,8 @@ import pytest
 from support import sequences
 
 from fieldpose.bus.messages import Encoding
+from fieldpose.bus.reading import info, read_recording
 from fieldpose.bus.recording import RecordingWriter
-from fieldpose.bus.replay import info, read_recording
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.evaluation.edited import read_edit, read_visibility
 from fieldpose.deploy.evaluation.edits import EDITS

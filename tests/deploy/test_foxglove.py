@@ -25,8 +25,8 @@ from support.pictures import needs
 from fieldpose.bus import messages, topics
 from fieldpose.bus.messages import Correspondences, Followed, Frame, Header, Message, Reason, State, TrackingState, View
 from fieldpose.bus.ports import first_header
+from fieldpose.bus.reading import read_recording
 from fieldpose.bus.recording import RecordingWriter
-from fieldpose.bus.replay import read_recording
 from fieldpose.bus.topics import Address, Topic
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.foxglove import channels, drawing

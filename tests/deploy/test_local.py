@@ -12,7 +12,7 @@ import pytest
 from support.pictures import needs
 
 from fieldpose.bus.messages import State
-from fieldpose.bus.replay import info, read_recording
+from fieldpose.bus.reading import info, read_recording
 from fieldpose.bus.topics import STATE
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.commands.run import planned

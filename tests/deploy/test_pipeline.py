@@ -16,7 +16,7 @@ import psutil
 import pytest
 from support.commands import command
 
-from fieldpose.bus.replay import info
+from fieldpose.bus.reading import info
 from fieldpose.bus.topics import ALL
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.graph import (

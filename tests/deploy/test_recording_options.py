@@ -16,9 +16,9 @@ from fieldpose.bus.codec import encode
 from fieldpose.bus.messages import Header
 from fieldpose.bus.open_recording import partial_path
 from fieldpose.bus.ports import Outbox
+from fieldpose.bus.reading import info
 from fieldpose.bus.recorder import Recorder
 from fieldpose.bus.recovery import recover
-from fieldpose.bus.replay import info
 from fieldpose.bus.splitting import Split
 from fieldpose.bus.topics import ALL, STATE, Address
 from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus

@@ -11,7 +11,7 @@ import pytest
 from support import bus_samples
 
 from fieldpose.bus.ports import Outbox
-from fieldpose.bus.replay import info
+from fieldpose.bus.reading import info
 from fieldpose.bus.topics import POSE, STATE, Address
 from fieldpose.bus.transport import ZenohBus
 from fieldpose.deploy.cli import main

@@ -15,7 +15,7 @@ from support import bus_samples
 from fieldpose.bus.memory import MemoryBus
 from fieldpose.bus.messages import Failure, Header, Pose, Reason, State, TrackingState
 from fieldpose.bus.ports import Outbox, first_header
-from fieldpose.bus.replay import RecordingInfo, SourceInfo, TopicInfo
+from fieldpose.bus.reading import RecordingInfo, SourceInfo, TopicInfo
 from fieldpose.bus.topics import (
     CORRESPONDENCES,
     ESTIMATE,

@@ -11,7 +11,7 @@ import pytest
 from support.commands import save_empty_field
 from support.pictures import needs
 
-from fieldpose.bus.replay import info, read_recording
+from fieldpose.bus.reading import info, read_recording
 from fieldpose.bus.topics import FRAME, STATE
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.plan import Plan

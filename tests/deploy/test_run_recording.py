@@ -14,9 +14,9 @@ from fieldpose.bus.memory import MemoryBus
 from fieldpose.bus.messages import Header
 from fieldpose.bus.open_recording import partial_path
 from fieldpose.bus.ports import Outbox
+from fieldpose.bus.reading import info
 from fieldpose.bus.recorder import RecorderHandler, Store
 from fieldpose.bus.recording import RecordingWriter
-from fieldpose.bus.replay import info
 from fieldpose.bus.ring import SnapshotConfig, Snapshots
 from fieldpose.bus.topics import GUESS, TRUTH, Address
 from fieldpose.deploy.cli import main

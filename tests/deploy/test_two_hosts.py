@@ -13,7 +13,7 @@ import pytest
 
 from fieldpose.bus.messages import Stats
 from fieldpose.bus.open_recording import partial_path
-from fieldpose.bus.replay import info, read_recording
+from fieldpose.bus.reading import info, read_recording
 from fieldpose.bus.topics import STATS
 from fieldpose.deploy.benchmarks.two_hosts import TwoHosts, two_hosts
 from fieldpose.deploy.cli import main

@@ -22,7 +22,7 @@ from support.commands import command, fieldpose
 import fieldpose as fieldpose_api
 from fieldpose.bus.messages import CameraInfo, Followed, Frame, Reason, State, TrackingState
 from fieldpose.bus.ports import first_header
-from fieldpose.bus.replay import info, read_recording
+from fieldpose.bus.reading import info, read_recording
 from fieldpose.bus.topics import FRAME, STATE
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.scene import demo_file

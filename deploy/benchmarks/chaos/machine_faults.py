@@ -18,8 +18,8 @@ import numpy as np
 
 from fieldpose.bus.messages import TrackingState
 from fieldpose.bus.open_recording import partial_path
+from fieldpose.bus.reading import info
 from fieldpose.bus.recovery import recover
-from fieldpose.bus.replay import info
 from fieldpose.deploy.benchmarks.chaos.events import PAUSE_S, Event, Kind
 from fieldpose.deploy.benchmarks.chaos.judging import Verdict, Wrong, back_s
 from fieldpose.deploy.benchmarks.chaos.rounds import Played

@@ -10,7 +10,7 @@ import numpy as np
 from cachetools import FIFOCache
 
 from fieldpose.bus.messages import Frame, Truth
-from fieldpose.bus.replay import Recorded, of_another_program, read_recording
+from fieldpose.bus.reading import Recorded, of_another_program, read_recording
 from fieldpose.bus.topics import FRAME, TRUTH, Address, key_matches
 from fieldpose.errors import RecordingError, SourceError
 from fieldpose.stages.camera.calibration import Calibrator

@@ -9,9 +9,10 @@ from typing import cast, get_args
 import pytest
 from support.pictures import needs
 
+from fieldpose.bus.mcap_files import Attachment
 from fieldpose.bus.messages import State, Truth
+from fieldpose.bus.reading import read_attachment, read_recording
 from fieldpose.bus.recording import RecordingWriter
-from fieldpose.bus.replay import Attachment, read_attachment, read_recording
 from fieldpose.bus.topics import BY_NAME, POSE, STATE, TRUTH, Address
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.commands.run import planned

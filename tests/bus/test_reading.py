@@ -1,9 +1,7 @@
-"""Reading recordings whole, damaged and forged; sending them again."""
+"""Reading recordings whole, damaged and forged."""
 
 from __future__ import annotations
 
-import threading
-import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -14,13 +12,12 @@ from hypothesis import strategies as st
 from support.bus_samples import ADDRESS, every_message, frame, guess, same, truth
 
 from fieldpose.bus.codec import encode
+from fieldpose.bus.mcap_files import Attachment
 from fieldpose.bus.messages import CameraOrigin, Header
-from fieldpose.bus.ports import Inbox
+from fieldpose.bus.reading import info, read_attachment, read_recording
 from fieldpose.bus.recording import RecordingWriter
 from fieldpose.bus.recovery import recover
-from fieldpose.bus.replay import Attachment, info, read_attachment, read_recording, replay
-from fieldpose.bus.topics import FRAME, GUESS, STATE, TRUTH, Address
-from fieldpose.bus.transport import MemoryBus
+from fieldpose.bus.topics import FRAME, GUESS, STATE, TRUTH
 from fieldpose.errors import RecordingError
 
 SECOND_NS = 10**9
@@ -172,37 +169,3 @@ class TestDamage:
         for read in (lambda p: list(read_recording(p)), info, lambda p: recover(p, saved)):
             with suppress(RecordingError):
                 read(path)
-
-
-class TestReplay:
-    def test_frames_keep_their_ids_and_capture_times_and_get_a_new_sender(self, recording: Path) -> None:
-        bus = MemoryBus()
-        inbox = Inbox(bus, ADDRESS, [FRAME, GUESS], {FRAME: 64})
-        assert replay(bus, recording, {FRAME, GUESS}, rate=None) == 7
-        headers = [item.message.header for item in inbox.drain()]
-        assert [(header.frame_id, header.pass_index, header.capture_ns) for header in headers] == [
-            (9, 2, 1009),
-            *((n, 0, 1000 + n) for n in range(6)),
-        ]
-        assert [header.sequence for header in headers] == [0, *range(6)]
-        assert {header.source for header in headers} == {"replay"}
-        assert all(header.sent_ns > 1000 for header in headers)
-
-    def test_the_rate_is_kept(self, recording: Path) -> None:
-        for rate, seconds in ((1.0, 0.5), (4.0, 0.125)):
-            started = time.monotonic()
-            replay(MemoryBus(), recording, {FRAME}, rate=rate)
-            assert seconds <= time.monotonic() - started < seconds + 0.3
-
-    def test_another_pipeline_may_be_the_target(self, recording: Path) -> None:
-        bus, target = MemoryBus(), Address("test", "cup", "other")
-        inbox = Inbox(bus, target, [TRUTH])
-        replay(bus, recording, {TRUTH}, rate=None, address=target)
-        assert len(inbox.drain()) == 6
-
-    def test_it_can_be_stopped(self, recording: Path) -> None:
-        stop = threading.Event()
-        threading.Timer(0.05, stop.set).start()
-        started = time.monotonic()
-        assert replay(MemoryBus(), recording, {FRAME}, rate=0.01, stop=stop) == 1
-        assert time.monotonic() - started < 2.0

@@ -22,14 +22,21 @@ KEPT = 1024
 """Senders, or keys, of which something is remembered; the longest silent is forgotten."""
 _BURST, _PER_S = 10_000, 10_000.0
 """So many messages at once, and a second, one sender may have sent without a receiver having seen any."""
+_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
+"""Goes on while this machine is suspended, as senders on others do."""
+
+
+def clock_s() -> float:
+    """Seconds, of a clock that nobody sets and that no suspension stops, where the system has one."""
+    return time.clock_gettime(_CLOCK)
 
 
 class Numbers:
-    """Tells whether a sender's number can follow on the last; `now_s` is the monotonic clock's."""
+    """Tells whether a sender's number can follow on the last; `now_s` is that of `clock_s`."""
 
     def __init__(self) -> None:
         self._last: LRUCache[tuple[str, str, int], tuple[int, float]] = LRUCache(KEPT)
-        self._began_s = time.monotonic()
+        self._began_s = clock_s()
 
     def follows(self, key: str, header: Header, now_s: float) -> bool:
         """Whether it can, and then it is the last. Without an instance a sender may begin again, from 0."""
@@ -62,7 +69,7 @@ class Senders:
         """Why a message is not believed, None where it is."""
         with self._lock:
             why = self._doubt(topic, key, header)
-            if why is None and not self._numbers.follows(key, header, time.monotonic()):
+            if why is None and not self._numbers.follows(key, header, clock_s()):
                 why = f"number {header.sequence} cannot follow on the last"
         return None if why is None else f"{topic.name}: {why}, of a sender that says it is {header.source!r}"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from functools import partial
 from typing import Any
 
@@ -12,7 +12,7 @@ from fieldpose.bus.codec import decode_header
 from fieldpose.bus.messages import Header, Message, State, Stats
 from fieldpose.bus.ports import Inbox, Sequences
 from fieldpose.bus.protocol import Bus
-from fieldpose.bus.senders import Senders
+from fieldpose.bus.senders import KEPT, Senders
 from fieldpose.bus.topics import CAMERA_INFO, FRAME, STATE, STATS, TRUTH, Address, Topic
 from fieldpose.deploy.reporting.gathering import TIMED, Gathering
 from fieldpose.deploy.reporting.results import FrameResult
@@ -35,7 +35,7 @@ class Collector:
     def __init__(self, bus: Bus, address: Address, object_from_dataset: Similarity | None = None) -> None:
         self.stats: LRUCache[str, Stats] = LRUCache(_STAGES_KEPT)
         self.newest_state: State | None = None
-        self.observed: Counter[str] = Counter()
+        self.observed: LRUCache[str, int] = LRUCache(KEPT)
         self.sent = 0
         self._numbers = Sequences(from_start=True)
         self._gathering = Gathering(object_from_dataset)
@@ -58,7 +58,7 @@ class Collector:
         while self._headers:
             self._gathering.note_header(*self._headers.popleft())
         for received in self._inbox.drain():
-            self.observed[received.key] += 1
+            self._observe(received.key)
             if not isinstance(received.message, Stats) or received.key.endswith(f"/{received.message.stage}"):
                 self._note(received.message)
 
@@ -72,6 +72,14 @@ class Collector:
             self._reported_ns.popleft()
         return len(self._reported_ns) / (_RATE_WINDOW_NS / 1e9)
 
+    @property
+    def forgotten(self) -> int:
+        """Frames that came before those in `results`, of which nothing is known any more."""
+        return self._gathering.forgotten
+
+    def _observe(self, key: str) -> None:
+        self.observed[key] = self.observed.get(key, 0) + 1
+
     def _timed(self, topic: Topic[Any], key: str, payload: bytes, received_ns: int) -> None:
         try:
             header = decode_header(payload)
@@ -79,7 +87,7 @@ class Collector:
             return  # the stages refuse and count it
         if self._senders.doubt(topic, key, header) is not None:
             return
-        self.observed[key] += 1
+        self._observe(key)
         if topic is FRAME:
             # By the camera's own numbers: where this process is kept from running, it may miss some.
             self.sent += 1 + self._numbers.seen(key, header)

@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+COMMENTS = {"FIELDPOSE_HASH": "#", "FIELDPOSE_SEMICOLON": ";"}
+"""To be in supervisord's environment: after a space these begin a comment in its file, wherever they stand."""
 USER_ERROR = 2
 """The exit code of a process that was given something that only the user can mend."""
 
@@ -70,6 +72,12 @@ def _program(program: Program) -> dict[str, object]:
 
 
 def _section(name: str, content: Mapping[str, object]) -> str:
-    # A percent sign begins an expansion in these files, a semicolon after a space a comment.
-    lines = [f"{key}={str(value).replace('%', '%%')}" for key, value in content.items() if value != ""]
+    lines = [f"{key}={_escaped(str(value))}" for key, value in content.items() if value != ""]
     return "\n".join([f"[{name}]", *lines, ""])
+
+
+def _escaped(value: str) -> str:
+    escaped = value.replace("%", "%%")
+    for name, sign in COMMENTS.items():
+        escaped = escaped.replace(sign, f"%(ENV_{name})s")
+    return escaped

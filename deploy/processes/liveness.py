@@ -19,6 +19,7 @@ from typing import Literal, NamedTuple
 
 import psutil
 
+from fieldpose.bus.messages import Stats
 from fieldpose.bus.node import STATS_PERIOD_S
 
 MISSED = 2
@@ -42,6 +43,12 @@ class Life:
     heartbeat: Hashable | None
     ready: bool
     loops: bool = True
+
+    @classmethod
+    def by_stats(cls, name: str, pid: int, said: Sequence[Stats]) -> Life:
+        """Of a stage, by what it said last in each of its pipelines, where its predecessor may still be the last."""
+        beats = tuple(stats.header.sent_ns for stats in said)
+        return cls(name, pid, beats or None, bool(said) and all(stats.ready for stats in said))
 
 
 @dataclass(frozen=True)
@@ -154,11 +161,11 @@ def _look_at_thread(watched: _Watched, passed_s: float) -> None:
 
 
 def _thread_of(pid: int) -> _Thread | None:
-    """The main thread of a process; None where it is gone."""
+    """The main thread of a process; None where it is gone, or the system does not tell how often it was switched to."""
     try:
         process = psutil.Process(pid)
         with process.oneshot():
             status, switches = process.status(), tuple(process.num_ctx_switches())
-    except psutil.Error:
+    except (psutil.Error, NotImplementedError):  # the latter where the kernel does not tell switches
         return None
     return _Thread(status == psutil.STATUS_STOPPED, status in _ASLEEP, switches)

@@ -170,6 +170,7 @@ class _Running:
             sent=collector.sent,
             stats=collector.stats,
             observed=collector.observed,
+            forgotten=collector.forgotten,
             restarts={member.row.name: restarts[member.name] for member in its if member.name in restarts},
             plan=plan.notes,
             recording=None if recording is None else recording.of(plan.settings.address),
@@ -238,8 +239,7 @@ class _Running:
             for plan, collector in zip(self._plans, self._collectors, strict=True)
             if plan in member.plans and (stats := collector.stats.get(member.row.name)) is not None
         ]
-        beats = tuple(stats.header.sent_ns for stats in said)
-        return Life(member.name, pid, beats or None, any(stats.ready for stats in said))
+        return Life.by_stats(member.name, pid, said)
 
     def _finish(self, finished: bool) -> None:
         """End the stages, then the recorder, so that it has all that they said, then the hub."""

@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Any
 
 from fieldpose.deploy.graph import thread_environment
-from fieldpose.deploy.processes.configuration import USER_ERROR, Program, configuration
+from fieldpose.deploy.processes.configuration import COMMENTS, USER_ERROR, Program, configuration
 from fieldpose.deploy.processes.lifeline import PARENT, TEMPORARY
 from fieldpose.deploy.processes.rpc import Transport
 from fieldpose.deploy.processes.sessions import end_session
@@ -97,7 +97,7 @@ class Supervisor:
                 cwd=self._folder,
                 stderr=subprocess.STDOUT,
                 # The libraries that it imports are to start no threads.
-                env={**os.environ, **thread_environment(1), PARENT: str(os.getpid())},
+                env={**os.environ, **thread_environment(1), **COMMENTS, PARENT: str(os.getpid())},
                 # A Ctrl-C at the terminal is for the command, which then stops the processes in order.
                 start_new_session=True,
             )

@@ -43,13 +43,13 @@ class Gathering:
     """Everything about the frames of one pipeline.
 
     object_from_dataset: into the frame that poses are in; true ones are in that of the dataset. kept: how many of the
-    newest frames, None for all.
+    newest frames, None for all; `forgotten`: how many came before.
     """
 
     def __init__(self, object_from_dataset: Similarity | None = None, kept: int | None = FRAMES_KEPT) -> None:
-        self._kept = kept
         self._object_from_dataset = object_from_dataset or Similarity.identity()
         self._kept = kept
+        self.forgotten = 0
         self._frames: OrderedDict[tuple[int, int], _Seen] = OrderedDict()
 
     def note_header(self, topic: Topic[Any], header: Header) -> None:
@@ -92,6 +92,7 @@ class Gathering:
             seen = self._frames[key] = _Seen(header.capture_ns)
             if self._kept is not None and len(self._frames) > self._kept:
                 self._frames.popitem(last=False)
+                self.forgotten += 1
         return seen
 
 

@@ -97,6 +97,8 @@ def rows(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     sent, dropped = summary["frames_sent"], summary["dropped_at_the_door"]
     yield "frames sent / dropped at the door", f"{sent} / {dropped}"
     yield "frames / with a pose / lost", f"{summary['frames']} / {summary['poses_ok']} / {summary['frames_lost']}"
+    if summary["frames_forgotten"]:
+        yield "frames before, in no figure below", str(summary["frames_forgotten"])
     if summary["reasons"]:
         reasons = ", ".join(f"{reason_in_words(reason)} {count}x" for reason, count in summary["reasons"].items())
         yield "not sure, or without a pose, because", reasons

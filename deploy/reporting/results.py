@@ -1,7 +1,8 @@
 """What a run has achieved: a row for each frame, and the figures that `--json` gives.
 
 The keys of a summary, which programs may rely on:
-  frames             frames that have come to an end, with a pose or without
+  frames             frames that have come to an end, with a pose or without, of those that are remembered
+  frames_forgotten   frames that came before: of a run the newest 100,000 are remembered, and all figures are of these
   frames_lost        of these, the frames that were given up because no answer came (a stage died)
   frames_sent        frames that the camera has sent
   dropped_at_the_door  frames that tracking has not answered and not let in, because enough were in flight
@@ -123,13 +124,15 @@ class FrameResult:
 class RunResult:
     """What a run has left: its frames, and what was heard of its processes.
 
-    `sent`: frames by the camera's own numbers; `observed`: messages that the command itself has heard, by key;
+    `sent`: frames by the camera's own numbers; `forgotten`: how many came before `frames`; `observed`: messages that
+    the command itself has heard, by key;
     `recording_error`: why not everything was recorded that should have been; `interrupted`: by Ctrl-C or SIGTERM,
     before the source had ended; `start_s`: until all processes were ready.
     """
 
     frames: Sequence[FrameResult]
     sent: int = 0
+    forgotten: int = 0
     stats: Mapping[str, Stats] = field(default_factory=dict)
     observed: Mapping[str, int] = field(default_factory=dict)
     restarts: Mapping[str, int] = field(default_factory=dict)
@@ -149,8 +152,9 @@ def summarise(run: RunResult) -> dict[str, Any]:
     return {
         "frames": len(admitted),
         "frames_lost": sum(result.outcome == "lost" for result in admitted),
+        "frames_forgotten": run.forgotten,
         "frames_sent": run.sent,
-        "dropped_at_the_door": run.sent - len(admitted),
+        "dropped_at_the_door": max(0, run.sent - run.forgotten - len(admitted)),
         "poses_ok": sum(result.cam_from_object is not None for result in admitted),
         **accuracy(admitted),
         "rate_hz": rate_hz(admitted),

@@ -17,6 +17,8 @@ from fieldpose.stages.geometry import Camera
 _BURST = 8
 _DEFAULT_RATE_HZ = 30.0
 _HELD_UP_NS = 10**9
+_LONGEST_WAIT_S = 1.0
+"""A clock that is set back meanwhile is noticed after that."""
 Clock = Literal["none", "own", "wall"]
 
 
@@ -88,6 +90,7 @@ class Feed:
         self._next: CapturedFrame | None = None
         self._exhausted = False
         self._start: tuple[int, int] | None = None
+        self._now_ns = 0
         self._sent = 0
         self._objects: tuple[str | None, ...] = config.objects or (None,)
         self._awaited: int | None = None
@@ -100,11 +103,14 @@ class Feed:
     def due(self, now_ns: int) -> Iterator[tuple[CapturedFrame, int]]:
         """Frames to send now, each with its capture time since the epoch; a device is waited for.
 
-        Live ones that are more than a second late, as after the machine was suspended, move all that follow.
-        `held_up_ns` is how far.
+        Live ones that are more than a second late, as after the machine was suspended, move all that follow
+        (`held_up_ns` is how far), and so does a clock that is set back.
 
         Raises what the source raises where it cannot be read on.
         """
+        if self._plays and now_ns < self._now_ns:
+            self._move(now_ns - self._now_ns)
+        self._now_ns = now_ns
         for _ in range(1 if self._clock == "wall" else _BURST):
             frame = self._peek() if self._may_send(now_ns) else None
             if frame is None:
@@ -114,16 +120,18 @@ class Feed:
                 if capture_ns > now_ns:
                     return
                 if now_ns - capture_ns > _HELD_UP_NS:
-                    self._go_on_from(now_ns, capture_ns)
+                    # A camera does not make up for a pause by frames in a rush.
+                    self.held_up_ns += now_ns - capture_ns
+                    self._move(now_ns - capture_ns)
                     capture_ns = now_ns
             self._note_sent(frame, now_ns)
             yield frame, capture_ns
 
     def wait_s(self, now_ns: int) -> float | None:
-        """How long until the next frame is due; None where that is not known (yet)."""
+        """How long until it may be due again; None where that is not known (yet)."""
         if self._next is None or not self._plays or self._start is None:
             return None
-        return max(self._capture_ns(self._next, now_ns) - now_ns, 0) * 1e-9
+        return min(max(self._capture_ns(self._next, now_ns) - now_ns, 0) * 1e-9, _LONGEST_WAIT_S)
 
     def sign_of_life(self, frame_id: int, now_ns: int) -> None:
         """A pass over that frame has come back."""
@@ -156,11 +164,10 @@ class Feed:
         """Whether it gives frames that are there already as a camera would."""
         return self._pace == "live" and self._clock != "wall"
 
-    def _go_on_from(self, now_ns: int, capture_ns: int) -> None:
-        """After a pause of the machine or the process: a camera does not make up for it by frames in a rush."""
+    def _move(self, by_ns: int) -> None:
+        """Have all frames that are still to come later by so much."""
         if self._start is not None:
-            self.held_up_ns += now_ns - capture_ns
-            self._start = (self._start[0] + now_ns - capture_ns, self._start[1])
+            self._start = (self._start[0] + by_ns, self._start[1])
 
     def _may_send(self, now_ns: int) -> bool:
         if self._pace != "lockstep" or self._awaited is None:

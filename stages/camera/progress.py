@@ -16,7 +16,7 @@ class Progress:
         self.next = 0 if path is None else self._read(path)
 
     def advance(self) -> None:
-        """One more frame has been sent."""
+        """One more frame has been sent. Raises OSError where that cannot be noted."""
         self.next += 1
         if self._path is None:
             return

@@ -26,19 +26,31 @@ class Sender:
         self._feed = Feed(source, config, self._progress.next)
         self._error: FieldposeError | None = None
         self._held_up_ns = 0
+        self._noted = True
 
     def messages(self, now_ns: int) -> Iterator[Output]:
         """What is to be sent now; progress is noted after each frame."""
         try:
             for frame, capture_ns in self._feed.due(now_ns):
                 yield from messages_of(frame, capture_ns)
-                self._progress.advance()
+                self._note_progress()
             if self._feed.held_up_ns > self._held_up_ns:
                 by_s = round((self._feed.held_up_ns - self._held_up_ns) * 1e-9, 1)
                 stage_logger("camera").warning("frames were due earlier and go on from here", seconds=by_s)
                 self._held_up_ns = self._feed.held_up_ns
         except (FieldposeError, OSError) as error:
             self._error = error if isinstance(error, FieldposeError) else SourceError(str(error))
+
+    def _note_progress(self) -> None:
+        """A full disk ends no camera: it is only where a camera that is started again would go on."""
+        try:
+            self._progress.advance()
+        except OSError as error:
+            if self._noted:
+                stage_logger("camera").warning("where it has got to cannot be noted", error=str(error))
+            self._noted = False
+        else:
+            self._noted = True
 
     def wait_s(self, now_ns: int) -> float | None:
         """How long until the next frame is due; None where that is not known."""

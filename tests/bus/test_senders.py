@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -170,3 +171,17 @@ def test_a_pose_that_is_none_moves_nothing() -> None:
     pose = every_message()[POSE]
     pose.cam_from_object = np.full((4, 4), 1e300)  # type: ignore[attr-defined]
     assert pose_result(pose).cam_from_object is None  # type: ignore[arg-type]
+
+
+@pytest.mark.skipif(not hasattr(time, "CLOCK_BOOTTIME"), reason="this system has no clock that goes on in a suspension")
+def test_the_time_that_senders_may_have_sent_in_goes_on_while_this_machine_is_suspended(
+    bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time, "monotonic", lambda: 0.0)
+    boot_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    monkeypatch.setattr(time, "clock_gettime", lambda clock: boot_s if clock == time.CLOCK_BOOTTIME else 0.0)
+    inbox = Inbox(bus, ADDRESS, [GUESS])
+    for number, later_s in ((0, 0.0), (20_000, 0.0), (108_000, 3600.0)):
+        boot_s += later_s
+        put(bus, GUESS, Header("camera", number, number, 0, 1, 1, 7))
+    assert numbers(inbox) == [0, 108_000]

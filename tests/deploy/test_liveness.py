@@ -10,9 +10,12 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import msgspec
 import psutil
 import pytest
+from support.bus_samples import every_message
 
+from fieldpose.bus.topics import STATS
 from fieldpose.deploy.processes.liveness import SILENT_S, START_S, STILL_S, Life, Liveness
 
 SLEEPS = "import time; time.sleep(600)"
@@ -132,6 +135,26 @@ def test_faults_tell_who_ended_who_was_hung_and_when_each_was_back() -> None:
         assert [fault.what for fault in watch.liveness.faults] == ["ended", "hung"]
         assert watch.liveness.hung == ["a"]
         assert watch.liveness.faults[1].back_ns is None
+
+
+def test_a_stage_of_several_pipelines_is_ready_once_it_has_said_so_in_each() -> None:
+    def said(*ready: bool) -> Life:
+        stats = [msgspec.structs.replace(every_message()[STATS], ready=one) for one in ready]
+        return Life.by_stats("rendering", 1, stats)
+
+    assert said(True, True).ready
+    assert not said(False, True).ready
+    assert not said().ready
+    assert said().heartbeat is None
+
+
+def test_where_the_system_does_not_tell_switches_only_the_long_silence_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(self: psutil.Process) -> object:
+        raise NotImplementedError
+
+    monkeypatch.setattr(psutil.Process, "num_ctx_switches", unknown)
+    with process(SLEEPS) as one:
+        assert begun(one.pid).silence_s(SILENT_S + 1.0) == pytest.approx(SILENT_S, abs=2 * STEP_S)
 
 
 def test_one_that_is_gone_is_left_to_its_supervisor() -> None:

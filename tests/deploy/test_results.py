@@ -161,6 +161,21 @@ def test_what_goes_over_the_bus_becomes_rows(collected: tuple[Collector, dict[st
     assert rows[0].camera_origin == "calibrated"
 
 
+def test_of_a_long_run_the_newest_frames_are_kept_and_the_others_counted(
+    collected: tuple[Collector, dict[str, Outbox]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    collector, outboxes = collected
+    monkeypatch.setattr(collector._gathering, "_kept", 3)
+    for frame_id in range(5):
+        outboxes["camera"].publish(FRAME, bus_samples.frame(frame_id))
+        outboxes["tracking"].publish(STATE, state(first_header(frame_id, 1000 + frame_id), np.eye(4), 0.9))
+        collector.update()
+    figures = summarise(RunResult(collector.results(), sent=collector.sent, forgotten=collector.forgotten))
+    assert (figures["frames_sent"], figures["frames"], figures["frames_forgotten"]) == (5, 3, 2)
+    assert figures["dropped_at_the_door"] == 0
+    assert ("frames before, in no figure below", "2") in list(rows(figures))
+
+
 def test_a_failure_ends_a_pass_and_its_reason_is_told(collected: tuple[Collector, dict[str, Outbox]]) -> None:
     collector, outboxes = collected
     header = first_header(0, 1000)

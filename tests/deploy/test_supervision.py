@@ -110,17 +110,17 @@ if __name__ == "__main__":
 def test_the_environment_reaches_the_process_and_odd_characters_survive(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = tmp_path / "100 % odd"
+    folder = tmp_path / "100 % odd #1 ;2"
     folder.mkdir()
     program = Program(
         "a",
-        [sys.executable, "-c", "import os, sys; print(os.environ['X'], sys.argv[1], os.getcwd())", "50%; 'x y'"],
+        [sys.executable, "-c", "import os, sys; print(os.environ['X'], sys.argv[1], os.getcwd())", "50%; 'x y' #3 ;4"],
         {"X": "a%b"},
     )
     monkeypatch.chdir(folder)
     with Supervisor(folder, [program]) as supervisor:
         until(lambda: "it said nothing" not in supervisor.last_line("a"))
-        assert supervisor.last_line("a") == f"a%b 50%; 'x y' {folder}"
+        assert supervisor.last_line("a") == f"a%b 50%; 'x y' #3 ;4 {folder}"
 
 
 def test_a_folder_too_deep_for_a_socket_is_told(tmp_path: Path) -> None:

@@ -7,11 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from fieldpose.bus.topics import FRAME
 from fieldpose.errors import ConfigError
 from fieldpose.stages.camera.config import CameraConfig
 from fieldpose.stages.camera.core import CapturedFrame, Clock, Feed, Source
 from fieldpose.stages.camera.progress import Progress
+from fieldpose.stages.camera.sender import Sender
 from fieldpose.stages.geometry import Camera
 
 MS = 1_000_000
@@ -64,6 +67,16 @@ def test_after_a_pause_live_frames_go_on_at_their_pace_and_not_in_a_rush() -> No
     in_step.answered(0, 0, 0)
     sent(in_step, 5000)
     assert in_step.held_up_ns == 0
+
+
+def test_a_clock_that_is_set_back_stops_no_film() -> None:
+    live = feed("own")
+    sent(live, 0)
+    assert sent(live, 33) == [(1, 33)]
+    assert sent(live, -3600_000) == []
+    assert sent(live, -3600_000 + 33) == []
+    assert sent(live, -3600_000 + 34) == [(2, -3600_000 + 34)]
+    assert live.wait_s(START - 3600_000 * MS) == 0.134 + 0.033
 
 
 def test_every_other_frame_goes_at_its_own_time_and_a_second_start_goes_on_there() -> None:
@@ -200,6 +213,17 @@ def test_no_more_frames_than_asked_for_even_after_a_restart() -> None:
 
 def test_a_restarted_source_goes_on_at_once_where_it_was() -> None:
     assert sent(feed("own", first=3), 0) == [(3, 0)]
+
+
+def test_a_camera_goes_on_where_its_progress_cannot_be_noted(tmp_path: Path) -> None:
+    (tmp_path / "images").mkdir()
+    for i in range(3):
+        Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(tmp_path / "images" / f"{i}.png")
+    note = tmp_path / "gone" / "progress.json"
+    sender = Sender(CameraConfig(f"folder:{tmp_path / 'images'}", pace="fast", progress_file=note))
+    frames = [message.header.frame_id for topic, message in sender.messages(START) if topic is FRAME]
+    assert frames == [0, 1, 2]
+    sender.close()
 
 
 def test_progress_survives_and_belongs_to_its_source(tmp_path: Path) -> None:

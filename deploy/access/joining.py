@@ -20,6 +20,8 @@ from fieldpose.errors import TransportError, UsageError
 TLS_VARIABLE = "FIELDPOSE_TLS"
 """Environment variable with the folder of certificates, where no option names it."""
 _LOOK_S, _LEAST_S, _COMING_S = 0.1, 1.0, 60.0
+_OPEN_S = 5.0
+"""A hub of one's own may be hanging, or about to come, for so long before who listens is taken for another."""
 _FIRST_S, _LONGEST_S = 0.5, 8.0
 
 
@@ -95,9 +97,17 @@ def joint(hub: str, entry: Entry, names: Sequence[str], timeout_s: float = 0.0) 
             " --open where that hub lets everybody in"
         )
     deadline = time.monotonic() + timeout_s
+    told_s = time.monotonic() + min(timeout_s, _OPEN_S)
     while (local := keys_of(port_of(hub))) is None:
-        if not hub.startswith("tls/") and speaks_tls(host_of(hub), port_of(hub)) is False:
-            return Joint(hub)
+        if (
+            time.monotonic() > told_s
+            and speaks_tls(host_of(hub), port_of(hub)) is False
+            and keys_of(port_of(hub)) is None
+        ):
+            raise TransportError(
+                f"{hub} is of no run of yours, and who listens there speaks no TLS: it is an open hub, which may be"
+                " anybody's and is joined with --open, or hangs"
+            )
         if time.monotonic() > deadline:
             raise TransportError(why_refused(hub, None) or _no_keys(hub, timeout_s))
         time.sleep(_LOOK_S)
@@ -182,7 +192,7 @@ def access_as(folder: Path, role: str) -> Access:
 def _access(folder: Path, names: Sequence[str]) -> Access:
     from fieldpose.deploy.access.certificates import check_certificate
 
-    those = [name for name in names if certificate_of(folder, name).exists() and key_of(folder, name).exists()]
+    those = [name for name in names if _readable(certificate_of(folder, name)) and _readable(key_of(folder, name))]
     if not those:
         wanted = " or ".join(names)
         there = ", ".join(sorted(path.stem for path in folder.glob("*.key"))) or "none"
@@ -191,3 +201,14 @@ def _access(folder: Path, names: Sequence[str]) -> Access:
     check_certificate(access.authority)
     check_certificate(access.certificate)
     return access
+
+
+def _readable(path: Path) -> bool:
+    """False where there is none. Raises TransportError for one that may not be read."""
+    try:
+        path.open("rb").close()
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise TransportError(f"{path}: cannot be read: {error.strerror}") from error
+    return True

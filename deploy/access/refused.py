@@ -37,7 +37,7 @@ def nobody(hub: str, access: Access | None, waited_s: float) -> str:
         return said
     if access is None:
         return f"{said}; somebody listens there who is no hub, or hangs"
-    return f"{said}; somebody listens there, but not by TLS: a hub that is open is joined with --open"
+    return f"{said}; somebody listens there who hangs, or is no closed hub: one that is open is joined with --open"
 
 
 def speaks_tls(host: str, port: int) -> bool | None:

@@ -1,12 +1,13 @@
 """The keys of a run on this machine: made anew for each hub, and found by its port by other commands of the same user.
 
 They lie in a folder that only this user can enter, $XDG_RUNTIME_DIR/fieldpose or else fieldpose-UID among the temporary
-files, and are gone when the hub is; those that a killed run has left are not used, and go when the next one begins.
+files, and are gone when the hub is. Their owner holds a lock on the folder: without it they are those that a killed run
+has left, which are not used, and go when the next one begins.
 """
 
 from __future__ import annotations
 
-import json
+import fcntl
 import os
 import shutil
 import stat
@@ -17,12 +18,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-import psutil
-
 from fieldpose.deploy.access.roles import roles
 from fieldpose.errors import OutputError, TransportError
 
-_OWNER, _NEW = "owner.json", "new-"
+_OWNER, _NEW, _HUB = "owner", "making-", "hub-"
 _MADE_S = 60.0
 _PRIVATE = 0o700
 
@@ -44,17 +43,22 @@ def keys_for(port: int) -> Iterator[Path]:
     """
     base = _private(_bases()[0])
     _remove_stale(base)
-    folder, made = base / str(port), _made(base)
+    folder, made = base / f"{_HUB}{port}", _made(base)
+    lock = os.open(made, os.O_RDONLY)
     try:
-        # Seen by others once they are whole.
-        made.rename(folder)
-    except OSError:
-        shutil.rmtree(made, ignore_errors=True)
-        raise TransportError(f"port {port} is that of another run of yours; choose another with --listen") from None
-    try:
-        yield folder
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        try:
+            # Seen by others once they are whole.
+            made.rename(folder)
+        except OSError:
+            shutil.rmtree(made, ignore_errors=True)
+            raise TransportError(f"port {port} is that of another run of yours; choose another with --listen") from None
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        os.close(lock)
 
 
 def keys_of(port: int) -> Path | None:
@@ -70,8 +74,8 @@ def all_keys() -> list[RunKeys]:
             continue
         for folder in sorted(base.iterdir()):
             pid = _owner(folder)
-            if pid is not None and folder.name.isdigit():
-                found.append(RunKeys(int(folder.name), folder, pid))
+            if pid is not None and folder.name.startswith(_HUB):
+                found.append(RunKeys(int(folder.name.removeprefix(_HUB)), folder, pid))
     return found
 
 
@@ -80,8 +84,7 @@ def _made(base: Path) -> Path:
 
     folder = Path(tempfile.mkdtemp(dir=base, prefix=_NEW))
     make_certificates(folder, [role.name for role in roles()])
-    process = psutil.Process()
-    (folder / _OWNER).write_text(json.dumps({"pid": process.pid, "began": process.create_time()}), encoding="utf-8")
+    (folder / _OWNER).write_text(str(os.getpid()), encoding="utf-8")
     return folder
 
 
@@ -119,16 +122,22 @@ def _is_private(base: Path) -> bool:
 def _owner(folder: Path) -> int | None:
     """The process that has made the keys of a folder; None where it is gone."""
     try:
-        owner = json.loads((folder / _OWNER).read_text(encoding="utf-8"))
-        alive = abs(psutil.Process(owner["pid"]).create_time() - owner["began"]) < 1.0
-    except (OSError, ValueError, KeyError, TypeError, psutil.Error):
+        pid = int((folder / _OWNER).read_text(encoding="utf-8"))
+        looking = os.open(folder, os.O_RDONLY)
+    except (OSError, ValueError):
         return None
-    return int(owner["pid"]) if alive else None
+    try:
+        fcntl.flock(looking, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return pid
+    finally:
+        os.close(looking)
+    return None
 
 
 def _remove_stale(base: Path) -> None:
     for folder in base.iterdir():
         with suppress(FileNotFoundError):
             unfinished = folder.name.startswith(_NEW) and time.time() - folder.stat().st_mtime > _MADE_S
-            if unfinished or (folder.name.isdigit() and _owner(folder) is None):
+            if unfinished or (folder.name.startswith(_HUB) and _owner(folder) is None):
                 shutil.rmtree(folder, ignore_errors=True)

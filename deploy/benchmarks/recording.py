@@ -47,7 +47,9 @@ def measure(
     with tempfile.TemporaryDirectory(prefix="bench-record-", dir=folder) as out, echo.hub() as hub:
         record = Path(out) / "bench.mcap"
         account = _Account(record)
-        with _process("stage", NAME, "--record", record, "--record.split", split, "--connect", hub) as recorder:
+        with _process(
+            "stage", NAME, "--record", record, "--record.split", split, "--connect", hub, "--open"
+        ) as recorder:
             _wait_for_recorder(hub, recorder)
             watched = psutil.Process(recorder.pid)
             cpu_s, began = machine.cpu_s(watched), time.monotonic()

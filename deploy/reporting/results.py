@@ -132,7 +132,6 @@ class RunResult:
 
     frames: Sequence[FrameResult]
     sent: int = 0
-    forgotten: int = 0
     stats: Mapping[str, Stats] = field(default_factory=dict)
     observed: Mapping[str, int] = field(default_factory=dict)
     restarts: Mapping[str, int] = field(default_factory=dict)
@@ -142,6 +141,7 @@ class RunResult:
     recording_error: str | None = None
     interrupted: bool = False
     start_s: float = 0.0
+    forgotten: int = 0
 
 
 def summarise(run: RunResult) -> dict[str, Any]:

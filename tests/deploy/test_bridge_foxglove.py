@@ -164,7 +164,7 @@ def test_mistakes_are_one_line(
 def test_where_no_hub_is(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("fieldpose.deploy.commands.bridge_foxglove._HUB_S", 0.2)
     hub = f"tcp/127.0.0.1:{free_port()}"
-    assert main(["bridge", "foxglove", "--connect", hub, "--port", "0"]) == 2
+    assert main(["bridge", "foxglove", "--connect", hub, "--open", "--port", "0"]) == 2
     assert f"no hub answers at {hub}" in capsys.readouterr().err
 
 

@@ -319,12 +319,12 @@ def test_what_cannot_be_bridged_is_one_line(capsys: pytest.CaptureFixture[str]) 
     assert main(["bridge", "ros2", "--connect", nobody, "--router", nobody]) == 2
     assert f"--connect and --router are both {nobody}; expected the pipeline's hub" in capsys.readouterr().err
     with serving() as hub:
-        assert main(["bridge", "ros2", "--connect", hub, "--router", nobody]) == 2
+        assert main(["bridge", "ros2", "--connect", hub, "--open", "--router", nobody]) == 2
         said = capsys.readouterr().err
         assert said.startswith(f"fieldpose: no router of ROS at {nobody}; start rmw_zenohd there")
         assert said.count("\n") == 1
         with serving() as router:
-            assert main(["bridge", "ros2", "--connect", hub, "--router", router, "--object", "*"]) == 2
+            assert main(["bridge", "ros2", "--connect", hub, "--open", "--router", router, "--object", "*"]) == 2
             assert "pipeline */camera0: expected one, without *" in capsys.readouterr().err
 
 
@@ -374,7 +374,7 @@ def serving(where: str | None = None) -> Iterator[str]:
 
 @contextmanager
 def bridged(hub: str, router: str, *options: str) -> Iterator[subprocess.Popen[str]]:
-    line = command("bridge", "ros2", "--connect", hub, "--router", router, *options)
+    line = command("bridge", "ros2", "--connect", hub, "--open", "--router", router, *options)
     process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None

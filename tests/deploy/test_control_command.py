@@ -148,30 +148,30 @@ def hub() -> Iterator[str]:
 def test_each_pipeline_has_a_line_and_a_refusal_has_one_on_stderr(hub: str, capsys: pytest.CaptureFixture[str]) -> None:
     mug = "fieldpose/control/mug/camera0/tracking: initializing, 0 frames, not followed, "
     photos = "fieldpose/control/photos/camera0/tracking: "
-    assert main(["control", "show", "--connect", hub, "--object", "*"]) == 0
+    assert main(["control", "show", "--connect", hub, "--open", "--object", "*"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         f"{mug}0 requests carried out",
         f"{photos}initializing, 0 frames, not followed, 0 requests carried out",
     ]
-    assert main(["control", "reset", "--connect", hub, "--object", "mug"]) == 0
+    assert main(["control", "reset", "--connect", hub, "--open", "--object", "mug"]) == 0
     assert capsys.readouterr().out.splitlines() == [f"{mug}1 requests carried out"]
-    assert main(["control", "reset", "--connect", hub, "--object", "*"]) == 2
+    assert main(["control", "reset", "--connect", hub, "--open", "--object", "*"]) == 2
     printed = capsys.readouterr()
     assert printed.out.splitlines() == [f"{mug}2 requests carried out"]
     (line,) = printed.err.splitlines()
     assert line.startswith(f"fieldpose: {photos}reset: each frame stands by itself here")
-    assert main(["control", "solve", "3", "--connect", hub, "--object", "mug"]) == 2
+    assert main(["control", "solve", "3", "--connect", hub, "--open", "--object", "mug"]) == 2
     assert "set_solving: frames are not followed here" in only_line(capsys)
 
 
 def test_nobody_there_is_told(hub: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["control", "reset", "--connect", hub, "--object", "cup", "--timeout-s", "0.1"]) == 2
+    assert main(["control", "reset", "--connect", hub, "--open", "--object", "cup", "--timeout-s", "0.1"]) == 2
     line = only_line(capsys)
     assert "nobody answers at fieldpose/control/cup/camera0/tracking after 0.1 s; is that pipeline running" in line
 
 
 def test_the_public_interface_asks_too(hub: str) -> None:
-    with fieldpose.connect(hub, object="mug") as pipeline:
+    with fieldpose.connect(hub, open=True, object="mug") as pipeline:
         assert pipeline.reset(on_sphere(3, 4)).begins_at is not None
         values = pipeline.values()
         assert (values.requests, values.state) == (1, TrackingState.INITIALIZING)

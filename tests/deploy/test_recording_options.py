@@ -176,7 +176,7 @@ def test_a_recorder_is_asked_for_what_came_last(hub: str, tmp_path: Path, capsys
     recorder = Recorder(bus, Address("fieldpose", "*", "*"), None, RecordingOptions(snapshots=tmp_path).keep())
     publish_everything(bus)
     bus.wait_for_hub(20.0)
-    assert main(["record", "--snapshot", "10s", "--connect", hub]) == 0
+    assert main(["record", "--snapshot", "10s", "--connect", hub, "--open"]) == 0
     (path,) = tmp_path.iterdir()
     assert capsys.readouterr().out.startswith(f"{path}: {len(ALL)} messages of the last 0.")
     assert main(["info", str(path)]) == 0
@@ -186,7 +186,7 @@ def test_a_recorder_is_asked_for_what_came_last(hub: str, tmp_path: Path, capsys
 
 
 def test_a_recorder_that_keeps_only_the_last_leaves_nothing_unasked(hub: str, tmp_path: Path) -> None:
-    assert main(["record", "--snapshots", str(tmp_path), "--connect", hub, "--seconds", "0.3"]) == 0
+    assert main(["record", "--snapshots", str(tmp_path), "--connect", hub, "--open", "--seconds", "0.3"]) == 0
     assert list(tmp_path.iterdir()) == []
 
 

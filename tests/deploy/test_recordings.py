@@ -41,7 +41,7 @@ def talking(hub: str) -> Iterator[str]:
 
 def test_record_then_info(talking: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording, listed = tmp_path / "a.mcap", tmp_path / "a.json"
-    assert main(["record", str(recording), "--connect", talking, "--seconds", "0.6"]) == 0
+    assert main(["record", str(recording), "--connect", talking, "--open", "--seconds", "0.6"]) == 0
     assert "no message lost" in capsys.readouterr().out
     assert main(["info", str(recording), "--json", str(listed)]) == 0
     said, held = capsys.readouterr().out, json.loads(listed.read_text())
@@ -57,7 +57,7 @@ def test_recording_where_no_hub_is(
 ) -> None:
     monkeypatch.setattr("fieldpose.deploy.commands.record._HUB_S", 0.2)
     hub = f"tcp/127.0.0.1:{free_port()}"
-    assert main(["record", str(tmp_path / "a.mcap"), "--connect", hub, "--seconds", "1"]) == 2
+    assert main(["record", str(tmp_path / "a.mcap"), "--connect", hub, "--open", "--seconds", "1"]) == 2
     assert f"no hub answers at {hub}" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -66,7 +66,7 @@ def test_recover_saves_an_unfinished_recording_under_a_new_name(
     talking: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = tmp_path / "a.mcap"
-    assert main(["record", str(recording), "--connect", talking, "--seconds", "1.4"]) == 0
+    assert main(["record", str(recording), "--connect", talking, "--open", "--seconds", "1.4"]) == 0
     whole = recording.read_bytes()
     recording.unlink()
     # What was flushed after the first second is whole.
@@ -86,7 +86,7 @@ def test_a_recording_without_settings_cannot_be_replayed(
     talking: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = tmp_path / "a.mcap"
-    main(["record", str(recording), "--connect", talking, "--seconds", "0.2"])
+    main(["record", str(recording), "--connect", talking, "--open", "--seconds", "0.2"])
     capsys.readouterr()
     assert main(["replay", str(recording)]) == 2
     assert "holds no field" in capsys.readouterr().err.splitlines()[-1]

@@ -206,7 +206,7 @@ def test_a_state_of_tracking_that_is_gone_is_no_state_of_now(ready: bool, said: 
 def test_where_no_hub_is(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("fieldpose.deploy.commands.top._HUB_S", 0.2)
     hub = f"tcp/127.0.0.1:{free_port()}"
-    assert main(["top", "--once", "--connect", hub]) == 2
+    assert main(["top", "--once", "--connect", hub, "--open"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"no hub answers at {hub}" in line
 
@@ -217,7 +217,7 @@ def test_where_no_process_is(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     thread = threading.Thread(target=serve_hub, args=(hub,), kwargs={"stop": stop})
     thread.start()
     try:
-        assert main(["top", "--once", "--connect", hub, "--object", "mug"]) == 2
+        assert main(["top", "--once", "--connect", hub, "--open", "--object", "mug"]) == 2
     finally:
         stop.set()
         thread.join(ENOUGH_S)

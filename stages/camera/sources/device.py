@@ -41,6 +41,7 @@ def _frames(device: str, frame_id: int, calibration: Calibration, size: int | No
             image, resized = shrunk_with_camera(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), camera, size)
             yield CapturedFrame(frame_id, image, "rgb8", resized, f"camera{device}#{frame_id}", at_ns, origin=origin)
             frame_id += 1
+    raise SourceError(f"camera:{device}: gives no more frames; is it still plugged in?")
 
 
 @contextmanager

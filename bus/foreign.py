@@ -45,9 +45,9 @@ class _Channels:
 class ForeignRecording(_Channels, OpenRecording):
     """Writes such a file while it is recorded, so that a kill or a full disk leaves what came before."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, resume: bool = False) -> None:
         _Channels.__init__(self)
-        OpenRecording.__init__(self, path, "", CompressionType.ZSTD)
+        OpenRecording.__init__(self, path, "", CompressionType.ZSTD, resume)
 
     def write(self, topic: str, payload: bytes, log_ns: int, publish_ns: int, sequence: int) -> None:
         """Write an encoded message of a topic that was announced; times are nanoseconds since the epoch."""

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 from fieldpose.bus.codec import decode_header, encode
 from fieldpose.bus.messages import Header, Message
 from fieldpose.bus.node import Output
+from fieldpose.bus.open_recording import reason
 from fieldpose.bus.protocol import Bus, Closing, Sink
 from fieldpose.bus.requests import SaveSnapshot, decode_request
 from fieldpose.bus.ring import Snapshots
@@ -76,6 +77,10 @@ class _ByteQueue:
             self._ended = True
             self._changed.notify()
 
+    @property
+    def refusing(self) -> bool:
+        return self._refusing
+
     def refuse(self) -> None:
         """Let go of everything, now and from now on."""
         with self._changed:
@@ -94,6 +99,12 @@ class Store(Protocol):
     def messages(self) -> int:
         """How many have been written."""
 
+    def take_over(self) -> None:
+        """Go on with what an earlier recorder left unfinished, before anything is written; may last.
+
+        Raises RecordingError where that cannot be done; then it is left as it was, and the store has ended.
+        """
+
     def write_payload(self, key: str, topic: Topic[Any], payload: bytes, log_time_ns: int) -> None:
         """Write bytes from the wire; those that are no message are counted."""
 
@@ -109,7 +120,7 @@ class Store(Protocol):
     def close(self) -> bool:
         """Finish; return whether nothing was lost. Raises RecordingError and OSError."""
 
-    def end_early(self, error: OSError) -> RecordingError:
+    def end_early(self, error: Exception) -> RecordingError:
         """Finish as well as can be after a failure; what is to be told of it."""
 
 
@@ -134,7 +145,6 @@ class Recorder:
         self._queue = _ByteQueue(queue_bytes)
         self._senders = Senders(bus, address.site)
         self._refused = self._doubted = 0
-        # Listening begins first: taking over an unfinished recording can last.
         self._listening: list[Closing] = [
             bus.subscribe(address.key(topic), self._sink(topic), _CHANNEL_CAPACITY) for topic in topics
         ]
@@ -152,26 +162,35 @@ class Recorder:
         """How many have been written."""
         return self._store.messages if self._store is not None else 0
 
+    @property
+    def ended(self) -> bool:
+        """Whether it has given up, so that nothing that comes is written or kept any more."""
+        return self._queue.refusing
+
     def close(self) -> bool:
         """Write what is queued, finish the file, return whether it is lossless.
 
-        Raises RecordingError where writing failed, which says where what was written before is.
+        Raises RecordingError where writing failed, which says where what was written before is, or a snapshot did.
         """
         self._end_listening()
         self._queue.end()
         self._thread.join()
-        if self._store is not None:
+        told = [] if self.error is None else [str(self.error)]
+        lossless = True
+        if self._store is not None and self.error is None:
             self._store.note_left_out(self._refused, self._doubted)
+            try:
+                lossless = self._store.close()
+            except RecordingError as error:
+                told.append(str(error))
+            except Exception as error:
+                told.append(str(self._store.end_early(error)))
         if self.snapshots is not None:
             self.snapshots.close()
-        if self.error is not None:
-            raise self.error
-        if self._store is None:
-            return True
-        try:
-            return self._store.close()
-        except OSError as error:
-            raise self._store.end_early(error) from error
+            told += self.snapshots.failures
+        if told:
+            raise RecordingError("; ".join(told))
+        return lossless
 
     def _sink(self, topic: Topic[Any]) -> Sink:
         def sink(key: str, payload: bytes, received_ns: int) -> None:
@@ -205,10 +224,16 @@ class Recorder:
         self._senders.close()
 
     def _write(self) -> None:
-        while (items := self._queue.take(self._flush())) is not None:
-            for item in items:
-                self._write_item(item)
-                self._queue.done(item)
+        try:
+            # Here, not where it is opened: copying gigabytes must keep nobody from listening, nor a main loop waiting.
+            self._guarded(lambda store: store.take_over(), None)
+            while (items := self._queue.take(self._flush())) is not None:
+                for item in items:
+                    self._write_item(item)
+                    self._queue.done(item)
+        except Exception as error:
+            self._give_up(error)
+            self._queue.refuse()
 
     def _flush(self) -> float:
         """The seconds until this is to be called again."""
@@ -224,16 +249,26 @@ class Recorder:
         self._guarded(lambda store: store.write_payload(key, topic, content, received_ns), None)
 
     def _guarded(self, work: Callable[[Store], T], otherwise: T) -> T:
-        """Do something with the store, unless it has ended; where it fails it ends, and snapshots go on."""
+        """Do something with the store, unless it has ended; where that fails it ends, and snapshots go on."""
         if self._store is None or self.error is not None:
             return otherwise
         try:
             return work(self._store)
-        except OSError as error:
-            self.error = self._store.end_early(error)
+        except Exception as error:
+            self._give_up(error)
             if self.snapshots is None:
                 self._queue.refuse()
             return otherwise
+
+    def _give_up(self, error: Exception) -> None:
+        if self.error is not None:
+            return
+        if isinstance(error, RecordingError):
+            self.error = error
+        elif self._store is not None:
+            self.error = self._store.end_early(error)
+        else:
+            self.error = RecordingError(f"no snapshots are kept any more: {reason(error)}")
 
 
 class RecorderHandler:

@@ -14,12 +14,12 @@ from mcap.writer import CompressionType
 from fieldpose.bus.codec import decode, encode
 from fieldpose.bus.mcap_files import RECORDING_RECORD, SOURCE_RECORD, Attachment
 from fieldpose.bus.messages import Header, Message
-from fieldpose.bus.open_recording import OpenRecording, set_aside
+from fieldpose.bus.open_recording import OpenRecording
 from fieldpose.bus.ports import Sequences
 from fieldpose.bus.salvage import Salvage
 from fieldpose.bus.senders import KEPT
 from fieldpose.bus.topics import Topic, topic_of
-from fieldpose.errors import CodecError, RecordingError
+from fieldpose.errors import CodecError
 
 _MOST_KEYS = 4096
 """More than all topics of a hundred pipelines; MCAP has numbers for 65535."""
@@ -41,9 +41,8 @@ class _Tally:
 class RecordingWriter(OpenRecording):
     """Writes one recording of fieldpose's own messages.
 
-    An unfinished recording of its name is in the way, unless `resume` says to go on with what can be saved of it. With
-    `from_start` a sender's first message is its number 0, and what is before the first one seen is missing; expected:
-    by key and sender, the number of the first where this recording goes on with another.
+    With `from_start` a sender's first message is its number 0, and what is before the first one seen is missing;
+    expected: by key and sender, the number of the first where this recording goes on with another.
     """
 
     def __init__(
@@ -61,21 +60,13 @@ class RecordingWriter(OpenRecording):
         self._schemas: dict[type[Message], int] = {}
         self._sequences = Sequences(from_start, expected)
         self._tallies: dict[tuple[str, str], _Tally] = {}
-        before = set_aside(Path(path), resume)
-        super().__init__(path, "fieldpose", CompressionType.NONE)
+        super().__init__(path, "fieldpose", CompressionType.NONE, resume)
         try:
             self.add(metadata, attachments)
-            if before is not None:
-                self.copy(Salvage(before))
             self.flush()
-            if before is not None:
-                before.unlink()
         except OSError as error:
             self.discard()
             raise self._unwritable(error) from error
-        except RecordingError:
-            self.discard()
-            raise
 
     @property
     def expected(self) -> dict[tuple[str, str], int]:
@@ -109,7 +100,6 @@ class RecordingWriter(OpenRecording):
         self._put(key, topic, payload, header, log_time_ns)
 
     def copy(self, salvage: Salvage) -> int:
-        """Write every message that can be saved of another file; return their number."""
         before = self.messages
         for payload in salvage.payloads():
             topic = topic_of(payload.key)

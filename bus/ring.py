@@ -14,11 +14,11 @@ from fieldpose.bus.codec import decode
 from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.mcap_files import SNAPSHOT_RECORD, Attachment
 from fieldpose.bus.messages import TrackingState
-from fieldpose.bus.open_recording import partial_path
+from fieldpose.bus.open_recording import reason, unfinished_file
 from fieldpose.bus.recording import Metadata, RecordingWriter
 from fieldpose.bus.requests import SnapshotSaved
 from fieldpose.bus.topics import STATE, Topic
-from fieldpose.errors import CodecError, FieldposeError, RecordingError, RefusedError
+from fieldpose.errors import CodecError, RecordingError, RefusedError
 
 
 class _Kept(NamedTuple):
@@ -70,12 +70,16 @@ class SnapshotConfig:
 
 
 class Snapshots:
-    """Keeps what came last, and writes it as recordings of their own, with this metadata and these attachments."""
+    """Keeps what came last, and writes it as recordings of their own, with this metadata and these attachments.
+
+    saved: those that were written; failures: in a line each, the moments of a loss that could not be.
+    """
 
     def __init__(
         self, config: SnapshotConfig, metadata: Metadata | None = None, attachments: Iterable[Attachment] = ()
     ) -> None:
         self.saved: list[Path] = []
+        self.failures: list[str] = []
         self._config = config
         self._metadata, self._attachments = dict(metadata or {}), list(attachments)
         self._ring = Ring(config.seconds, config.max_bytes)
@@ -127,8 +131,9 @@ class Snapshots:
     def _save_in_thread(self, items: list[_Kept], key: str) -> None:
         try:
             saved = self._write(items, self._config.seconds, "lost", key)
-        except FieldposeError as error:
-            self._log.error("the moment of a loss could not be saved", error=str(error))
+        except Exception as error:
+            self.failures.append(reason(error))
+            self._log.error("the moment of a loss could not be saved", error=reason(error))
         else:
             self._log.info("tracking was lost; what came before is saved", path=saved.path)
 
@@ -142,9 +147,9 @@ class Snapshots:
             try:
                 for item in items:
                     writer.write_payload(*item)
-            except OSError as error:
+            except Exception as error:
                 writer.discard()
-                raise RecordingError(f"{path}: cannot be written: {error.strerror}; nothing was") from error
+                raise RecordingError(f"{path}: cannot be written: {reason(error)}; nothing was") from error
             writer.finish()
             self.saved.append(path)
         return SnapshotSaved(path=str(path), seconds=held, messages=writer.messages)
@@ -154,6 +159,6 @@ class Snapshots:
         number = 1
         while True:
             path = self._config.folder / f"{stem}{'' if number == 1 else f'-{number}'}.mcap"
-            if not path.exists() and not partial_path(path).exists():
+            if not path.exists() and unfinished_file(path) is None:
                 return path
             number += 1

@@ -13,13 +13,14 @@ class Interrupted(BaseException):
 
 
 class StopSignals:
-    """In the main thread, SIGTERM and SIGINT set `stop` while the context lasts.
+    """In the main thread, SIGTERM and SIGINT set `stop` while the context lasts, and a second one sets `again`.
 
     While `interrupting` is true they also raise Interrupted, out of whatever the main thread is doing.
     """
 
     def __init__(self, stop: threading.Event | None = None) -> None:
         self.stop = stop or threading.Event()
+        self.again = threading.Event()
         self.interrupting = False
         self._before: dict[int, Any] = {}
 
@@ -34,6 +35,6 @@ class StopSignals:
             signal.signal(number, before)
 
     def _caught(self, number: int, frame: FrameType | None) -> None:
-        self.stop.set()
+        (self.again if self.stop.is_set() else self.stop).set()
         if self.interrupting:
             raise Interrupted

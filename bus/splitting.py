@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from fieldpose.bus.mcap_files import EXPECTED_RECORD, PART_RECORD, Attachment
 from fieldpose.bus.messages import Header
-from fieldpose.bus.open_recording import partial_path
+from fieldpose.bus.open_recording import unfinished_file
 from fieldpose.bus.recording import Metadata, RecordingWriter
 from fieldpose.bus.salvage import Salvage
 from fieldpose.bus.topics import Topic
@@ -35,6 +35,8 @@ class Part(Protocol):
     messages: int
     size: int
 
+    def take_over(self) -> None: ...
+
     def write_payload(self, key: str, topic: Topic[Any], payload: bytes, log_time_ns: int) -> None: ...
 
     def note_dropped(self, key: str, header: Header) -> None: ...
@@ -45,7 +47,7 @@ class Part(Protocol):
 
     def close(self, damage: str | None = None, ended: str | None = None) -> bool: ...
 
-    def end_early(self, error: OSError) -> RecordingError: ...
+    def end_early(self, error: Exception) -> RecordingError: ...
 
 
 class OpenPart(Protocol):
@@ -68,12 +70,26 @@ class SplitWriter:
         self._closing: list[threading.Thread] = []
         self._failure: OSError | None = None
         self._began_ns: int | None = None
-        self._number, self._part = self._first(resume)
+        *self._earlier, self._number = self._begun(resume) or [0]
+        self._part = self._open(part_path(path, self._number), self._number, None, resume)
 
     @property
     def messages(self) -> int:
         """In all parts."""
         return self._finished + self._part.messages
+
+    def take_over(self) -> None:
+        self._part.take_over()
+        for number in self._earlier:
+            try:
+                part = self._open(part_path(self._path, number), number, None, True)
+                part.take_over()
+            except RecordingError as error:
+                # What can still be done is to end the last one.
+                raise OSError(str(error)) from error
+            self._close(part)
+            self._check()
+            self._finished += part.messages
 
     def write_payload(self, key: str, topic: Topic[Any], payload: bytes, log_time_ns: int) -> None:
         if self._is_full(log_time_ns):
@@ -95,7 +111,7 @@ class SplitWriter:
         self._wait()
         return self._part.close() and self._lossless
 
-    def end_early(self, error: OSError) -> RecordingError:
+    def end_early(self, error: Exception) -> RecordingError:
         for thread in self._closing:
             thread.join()
         return self._part.end_early(error)
@@ -129,7 +145,7 @@ class SplitWriter:
                 self._lossless = False
         except RecordingError as error:
             self._failure = OSError(str(error))
-        except OSError as error:
+        except Exception as error:
             self._failure = OSError(str(part.end_early(error)))
 
     def _wait(self) -> None:
@@ -141,18 +157,14 @@ class SplitWriter:
         if self._failure is not None:
             raise self._failure
 
-    def _first(self, resume: bool) -> tuple[int, Part]:
+    def _begun(self, resume: bool) -> list[int]:
+        """The numbers of unfinished parts to go on with."""
         there = parts_of(self._path)
         unfinished = sorted(number for number, whole in there.items() if not whole)
         if there and not (resume and unfinished):
             name = part_path(self._path, min(there))
             raise RecordingError(f"{name}: a part of another recording is there already; give another name")
-        for number in unfinished[:-1]:
-            part = self._open(part_path(self._path, number), number, None, True)
-            self._lossless = part.close() and self._lossless
-            self._finished += part.messages
-        number = unfinished[-1] if unfinished else 0
-        return number, self._open(part_path(self._path, number), number, None, bool(unfinished))
+        return unfinished
 
 
 def native_parts(
@@ -204,11 +216,9 @@ def _read_expected(values: Mapping[str, str]) -> dict[tuple[str, str], int]:
 
 def _begun_with(path: Path) -> dict[str, dict[str, str]]:
     """The metadata at the beginning of an unfinished file; none where there is none, or nothing yet in it."""
-    partial = partial_path(path)
-    aside = partial.with_name(f"{partial.name}.before")
-    begun = [file for file in (aside, partial) if file.exists() and file.stat().st_size > 0]
-    if not begun:
+    begun = unfinished_file(path)
+    if begun is None or begun.stat().st_size == 0:
         return {}
-    salvage = Salvage(begun[0])
+    salvage = Salvage(begun)
     next(salvage.payloads(), None)
     return dict(salvage.metadata)

@@ -22,6 +22,21 @@ class Tee:
         """In the first of them."""
         return self._stores[0].messages
 
+    def take_over(self) -> None:
+        told: list[str] = []
+        whole: list[Store] = []
+        for store in self._stores:
+            try:
+                store.take_over()
+                whole.append(store)
+            except RecordingError as error:
+                told.append(str(error))
+            except Exception as error:
+                told.append(str(store.end_early(error)))
+        if told:
+            why = OSError("its other form cannot be gone on with")
+            raise RecordingError("; ".join([*told, *(str(store.end_early(why)) for store in whole)]))
+
     def write_payload(self, key: str, topic: Topic[Any], payload: bytes, log_time_ns: int) -> None:
         for store in self._stores:
             store.write_payload(key, topic, payload, log_time_ns)
@@ -38,9 +53,19 @@ class Tee:
         return min(store.flush_if_due() for store in self._stores)
 
     def close(self) -> bool:
-        lossless = [store.close() for store in self._stores]
-        return all(lossless)
+        lossless = True
+        told: list[str] = []
+        for store in self._stores:
+            try:
+                lossless = store.close() and lossless
+            except RecordingError as error:
+                told.append(str(error))
+            except Exception as error:
+                told.append(str(store.end_early(error)))
+        if told:
+            raise RecordingError("; ".join(told))
+        return lossless
 
-    def end_early(self, error: OSError) -> RecordingError:
+    def end_early(self, error: Exception) -> RecordingError:
         told = [store.end_early(error) for store in self._stores]
         return RecordingError("; ".join(str(each) for each in told))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from fieldpose.bus.mcap_files import Attachment
-from fieldpose.bus.open_recording import check_new, partial_path
+from fieldpose.bus.open_recording import check_new, reason, unfinished_file
 from fieldpose.bus.recorder import Store
 from fieldpose.bus.recording import Metadata
 from fieldpose.bus.requests import MOST_SNAPSHOT_S
@@ -56,6 +57,8 @@ class RecordingOptions:
         self._check_room(attached)
         for path in self.files(record):
             _check_way(path, self.split is not None)
+        if self.snapshots is not None:
+            _check_folder(self.snapshots)
 
     def check_form(self, record: Path | None, pipelines: int) -> None:
         """Raise UsageError for options that cannot be, or not with so many pipelines."""
@@ -173,9 +176,8 @@ def recorded_files(record: Path, split: bool) -> list[Path]:
 
 def unfinished_files(record: Path, split: bool) -> list[Path]:
     """The files of a recording that were begun and not finished."""
-    if not split:
-        return [partial_path(record)] if partial_path(record).exists() else []
-    return [partial_path(part_path(record, number)) for number, whole in parts_of(record).items() if not whole]
+    begun = [part_path(record, number) for number in parts_of(record)] if split else [record]
+    return [there for path in begun if (there := unfinished_file(path)) is not None]
 
 
 def _opened(path: Path, opener: OpenPart, split: Split | None, resume: bool) -> Store:
@@ -193,6 +195,16 @@ def _check_way(path: Path, split: bool) -> None:
             f"{there}: an unfinished recording is in the way; `fieldpose recover {there}` saves what is in it, or"
             " remove it"
         )
+
+
+def _check_folder(folder: Path) -> None:
+    """Make the folder of snapshots. Raises RecordingError where nothing can be written there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise RecordingError(f"{folder}: no snapshots can be written there: {reason(error)}") from error
 
 
 def _measured(text: str, units: dict[str, float]) -> float | None:

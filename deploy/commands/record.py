@@ -94,10 +94,9 @@ class Options:
 
     def _wait(self, recorder: Recorder) -> None:
         end = None if self.seconds is None else time.monotonic() + self.seconds
-        going_on = self.options.snapshots is not None
         with StopSignals() as signals, progress_console().status("recording") as status:
             while not signals.stop.wait(0.2) and (end is None or time.monotonic() < end):
-                if recorder.error is not None and not going_on:
+                if recorder.ended:
                     return
                 written = "" if self.recording is None else f"{recorder.messages} messages, "
                 status.update(f"recording: {written}Ctrl-C ends it")

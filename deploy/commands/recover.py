@@ -7,7 +7,7 @@ from pathlib import Path
 
 import tyro
 
-from fieldpose.bus.open_recording import partial_path
+from fieldpose.bus.open_recording import aside_path, unfinished_file
 from fieldpose.bus.recovery import recover
 from fieldpose.errors import RecordingError
 
@@ -18,7 +18,8 @@ class Options:
 
     Example: fieldpose recover out/lego.mcap
 
-    An unfinished recording is FILE.mcap.partial; FILE.mcap will do for its name where only that is there.
+    An unfinished recording is FILE.mcap.partial; FILE.mcap will do for its name where only that is there. Where
+    FILE.mcap.partial.before is beside it, its copying into the other was cut short: then that is what is saved.
     """
 
     recording: tyro.conf.Positional[Path]
@@ -37,10 +38,12 @@ class Options:
         return 0
 
     def _damaged(self) -> Path:
-        partial = partial_path(self.recording)
-        return partial if not self.recording.exists() and partial.exists() else self.recording
+        named = self.recording
+        if named.suffix == ".partial" and aside_path(named.with_suffix("")).exists():
+            return aside_path(named.with_suffix(""))
+        return named if named.exists() else unfinished_file(named) or named
 
 
 def _default_out(damaged: Path) -> Path:
-    whole = damaged.with_suffix("") if damaged.suffix == ".partial" else damaged
+    whole = damaged.with_name(damaged.name.removesuffix(".before").removesuffix(".partial"))
     return whole.with_name(f"{whole.stem}.recovered{whole.suffix}")

@@ -43,8 +43,8 @@ class Options:
     table [objects.NAME] with field = FILE for each object, and [cameras.NAME] with source = SOURCE for each camera,
     and in it what differs from the others.
 
-    Ctrl-C ends the run and leaves a finished recording. What the keys of the JSON file mean stands in
-    deploy/reporting/results.py.
+    Ctrl-C ends the run and leaves a finished recording, which a second Ctrl-C does not wait for. What the keys of the
+    JSON file mean stands in deploy/reporting/results.py.
     """
 
     field: Annotated[

@@ -73,8 +73,8 @@ class Options:
         """Serve until Ctrl-C."""
         if not 1 <= self.port <= 65535:
             raise UsageError(f"--port {self.port}: expected 1 to 65535")
-        if self.what.name.endswith(".mcap.partial"):
-            whole = self.what.with_suffix("")
+        if self.what.name.endswith((".mcap.partial", ".mcap.partial.before")):
+            whole = self.what.with_name(self.what.name.removesuffix(".before").removesuffix(".partial"))
             raise UsageError(f"{self.what}: unfinished; `fieldpose recover {self.what} --out {whole}` mends it")
         return self._recording() if self.what.suffix == ".mcap" else self._live()
 

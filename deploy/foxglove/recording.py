@@ -9,9 +9,7 @@ from fieldpose.bus.codec import decode
 from fieldpose.bus.foreign import ForeignRecording
 from fieldpose.bus.mcap_files import RECORDING_RECORD
 from fieldpose.bus.messages import Header
-from fieldpose.bus.open_recording import set_aside
 from fieldpose.bus.ports import Sequences
-from fieldpose.bus.salvage import Salvage
 from fieldpose.bus.splitting import OpenPart
 from fieldpose.bus.topics import Address, Topic
 from fieldpose.deploy.foxglove.channels import ALL
@@ -24,8 +22,7 @@ from fieldpose.stages.nerf.metadata import FieldMetadata
 class FoxgloveRecording(ForeignRecording):
     """A recorder's store, of one pipeline: what `exporting.export` writes, in the order in which it was received.
 
-    before: the part that this one goes on with, if any. resume: go on with what can be saved of an unfinished file.
-    Raises RecordingError where nothing can be written.
+    before: the part that this one goes on with, if any. Raises RecordingError where nothing can be written.
     """
 
     def __init__(
@@ -42,16 +39,13 @@ class FoxgloveRecording(ForeignRecording):
         moved = None if field is None else field.frame.object_from_dataset
         self._converter: Converter = Converter(object_from_dataset=moved) if before is None else before._converter
         self._sequences: Sequences = Sequences(from_start, None if before is None else before._sequences.expected)
-        aside = set_aside(path, resume)
-        super().__init__(path)
+        super().__init__(path, resume)
+        # What was sent while nobody recorded cannot be counted: these messages have no numbers of their senders.
+        self._lossless = self._before is None
         try:
             for channel in ALL:
                 self.channel(channel.topic, channel.encoding, channel.schema)
             self.add(RECORD, about(path.name, address, field))
-            if aside is not None:
-                self.copy(Salvage(aside))
-                aside.unlink()
-            self._lossless = aside is None
             self.flush()
         except (OSError, RecordingError) as error:
             self.discard()

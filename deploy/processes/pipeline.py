@@ -35,9 +35,10 @@ _START_S = 300.0
 _RESTARTS_AT_START, _RESTARTS = 2, 10
 _POLL_S = 0.1
 _SETTLE_S = 0.2
-_STAGES_STOP_S, _RECORDER_STOP_S, _HUB_STOP_S = 2.0, 2.0, 0.5
-"""Together under the 5 s after a Ctrl-C."""
-_RECORDER_FINISHES_S = 60.0
+_STAGES_STOP_S, _HUB_STOP_S = 2.0, 0.5
+_RECORDER_FINISHES_S, _RECORDER_HURRIES_S = 60.0, 2.0
+"""It has up to 512 MB to write, on a disk that may be slow; a second Ctrl-C cuts it short, but one that follows at once
+has not to cost the recording."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ class _Running:
         self._liveness = Liveness()
         self._hub_looks = 0
         self._at = at
-        self._stop = signals.stop
+        self._stop, self._again = signals.stop, signals.again
         self._report = report
         self._limit = _RESTARTS_AT_START
         self._spared: tuple[str, ...] = ()
@@ -148,7 +149,7 @@ class _Running:
             start_s = self._start(bus) - began
             # Where other programs send the frames, it is Ctrl-C that ends the source.
             finished = self._watch() or not self._cameras
-            self._finish(finished)
+            self._finish()
             token.close()
             for collector in self._collectors:
                 collector.close()
@@ -241,7 +242,7 @@ class _Running:
         ]
         return Life.by_stats(member.name, pid, said)
 
-    def _finish(self, finished: bool) -> None:
+    def _finish(self) -> None:
         """End the stages, then the recorder, so that it has all that they said, then the hub."""
         self._report(self._progress("finishing"))
         time.sleep(_SETTLE_S)
@@ -249,7 +250,12 @@ class _Running:
         time.sleep(_SETTLE_S)
         for collector in self._collectors:
             collector.update()
-        self._supervisor.stop([RECORDER], _RECORDER_FINISHES_S if finished else _RECORDER_STOP_S)
+        began = time.monotonic()
+        self._supervisor.stop(
+            [RECORDER],
+            _RECORDER_FINISHES_S,
+            lambda: self._again.is_set() and time.monotonic() - began >= _RECORDER_HURRIES_S,
+        )
         self._supervisor.stop([HUB], _HUB_STOP_S)
 
     def _progress(self, phase: Literal["running", "finishing"]) -> Progress:
@@ -265,16 +271,19 @@ class _Running:
 
 
 def recorded_by(run: Run, supervisor: Supervisor) -> tuple[RecordingInfo | None, str | None]:
-    """What a run's recorder has written in fieldpose's own messages, and why that is not all, in a line."""
-    if run.record is None or not supervisor.has_run(RECORDER):
+    """What a run's recorder has written in fieldpose's own messages, and what it could not write, in a line."""
+    if not supervisor.has_run(RECORDER):
         return None, None
+    failure = supervisor.failure(RECORDER)
+    if run.record is None:
+        return None, failure
     split = run.recording.split is not None
-    error = None
+    error = failure
     if any(unfinished_files(path, split) for path in run.recording.files(run.record)):
         error = f"{run.record}: the recording was not finished: {supervisor.last_line(RECORDER)}"
     native = () if run.recording.format == "foxglove" else recorded_files(run.record, split)
     held = joined([info(path) for path in native])
-    if held is not None and held.ended is not None:
+    if error is None and held is not None and held.ended is not None:
         error = f"{held.path}: the recording ended early: {held.ended}; what came before is in it"
     return held, error
 

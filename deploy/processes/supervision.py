@@ -54,7 +54,12 @@ class ProcessInfo:
     @property
     def given_up(self) -> bool:
         """It has ended, and will not come back."""
-        return self.state == "FATAL" or (self.state == "EXITED" and self.exit_code == USER_ERROR)
+        return self.state == "FATAL" or (self.state == "EXITED" and self.failed)
+
+    @property
+    def failed(self) -> bool:
+        """It has ended with USER_ERROR, by itself or when it was stopped."""
+        return self.state in ("EXITED", "STOPPED") and self.exit_code == USER_ERROR
 
 
 class Supervisor:
@@ -150,15 +155,20 @@ class Supervisor:
         """End a process at once; it comes back, as after any other end that nobody asked for."""
         self._call(self._rpc.signalProcess, name, "KILL")
 
-    def stop(self, names: Sequence[str], timeout_s: float) -> bool:
-        """End processes, all at the same time; those that are still up after the timeout are killed.
+    def stop(self, names: Sequence[str], timeout_s: float, hurry: Callable[[], bool] = lambda: False) -> bool:
+        """End processes, all at the same time; those that are still up after the timeout, or in a hurry, are killed.
 
         Returns whether every one of them ended by itself.
         """
         try:
-            return self._stop(names, time.monotonic() + timeout_s)
+            return self._stop(names, time.monotonic() + timeout_s, hurry)
         except ProcessError:
             return False
+
+    def failure(self, name: str) -> str | None:
+        """The last line of a process that has ended with USER_ERROR, or does not stay up; None of any other."""
+        info = self._infos.get(name)
+        return self.last_line(name) if info is not None and (info.failed or info.given_up) else None
 
     def last_line(self, name: str) -> str:
         """What a process said last, without the name of the program in front."""
@@ -173,10 +183,10 @@ class Supervisor:
         """The file with what a process says on stdout and stderr."""
         return self._folder / f"{name}.log"
 
-    def _stop(self, names: Sequence[str], deadline: float) -> bool:
+    def _stop(self, names: Sequence[str], deadline: float, hurry: Callable[[], bool]) -> bool:
         for name in self._up(names):
             self._call(self._rpc.stopProcess, name, False)
-        while (up := self._up(names)) and time.monotonic() < deadline:
+        while (up := self._up(names)) and time.monotonic() < deadline and not hurry():
             time.sleep(_POLL_S)
         for name in up:
             self._call(self._rpc.signalProcess, name, "KILL")

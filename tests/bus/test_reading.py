@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import msgpack
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import CompressionType, IndexType, Writer
 from support.bus_samples import ADDRESS, every_message, frame, guess, same, truth
 
 from fieldpose.bus.codec import encode
-from fieldpose.bus.mcap_files import Attachment
+from fieldpose.bus.mcap_files import Attachment, reader_of
 from fieldpose.bus.messages import CameraOrigin, Header
 from fieldpose.bus.reading import info, read_attachment, read_recording
 from fieldpose.bus.recording import RecordingWriter
@@ -63,6 +67,58 @@ class TestReading:
         assert {each.source for each in facts.sources} == {"camera", ""}
         assert facts.metadata["config"] == {"a": "b"}
         assert facts.attachments == {"note": 5}
+
+    def test_info_reads_no_messages_of_a_file_that_has_an_index_of_them(self, recording: Path, tmp_path: Path) -> None:
+        damaged = bytearray(recording.read_bytes())
+        at = damaged.index(frame(3).image.tobytes())
+        damaged[at] ^= 1
+        path = tmp_path / "damaged.mcap"
+        path.write_bytes(damaged)
+        assert info(path) == replace(info(recording), path=str(path))
+        with pytest.raises(RecordingError, match="not a whole recording"):
+            list(read_recording(path))
+
+    @settings(derandomize=True, deadline=None, max_examples=80)
+    @given(
+        st.lists(st.tuples(st.integers(0, 3), st.integers(0, 2**62), st.integers(0, 300)), max_size=40),
+        st.sets(st.sampled_from([IndexType.ATTACHMENT, IndexType.CHUNK, IndexType.MESSAGE, IndexType.METADATA])),
+        st.fixed_dictionaries({name: st.booleans() for name in ("use_chunking", "use_statistics", "enable_crcs")}),
+        st.sampled_from(CompressionType),
+    )
+    def test_info_says_of_any_file_what_reading_it_says(
+        self,
+        tmp_path_factory: pytest.TempPathFactory,
+        messages: list[tuple[int, int, int]],
+        indexes: set[IndexType],
+        options: dict[str, bool],
+        compression: CompressionType,
+    ) -> None:
+        path = tmp_path_factory.mktemp("any") / "any.mcap"
+        index_types = functools.reduce(operator.or_, indexes, IndexType.NONE)
+        writer = Writer(str(path), chunk_size=500, compression=compression, index_types=index_types, **options)
+        writer.start()
+        # Two channels of one key.
+        channels = [writer.register_channel(name, "x", 0) for name in ("a", "b", "a", ADDRESS.key(FRAME))]
+        for channel, time_ns, size in messages:
+            writer.add_message(channels[channel], time_ns, bytes(size), time_ns)
+        writer.add_attachment(1, 1, "note", "text/plain", b"hello")
+        writer.finish()
+        times: dict[str, list[int]] = {}
+        with reader_of(path) as reader:
+            for _, channel, message in reader.iter_messages():
+                times.setdefault(channel.topic, []).append(message.log_time)
+        facts = info(path)
+        everything = [time_ns for those in times.values() for time_ns in those]
+        assert (facts.messages, facts.first_ns, facts.last_ns) == (
+            len(everything), min(everything, default=0), max(everything, default=0),
+        )  # fmt: skip
+        said = {topic.key: (topic.messages, topic.first_ns, topic.last_ns, topic.rate_hz) for topic in facts.topics}
+        assert said == {
+            key: (
+                len(those), min(those), max(those),
+                (len(those) - 1) / ((max(those) - min(those)) / 1e9) if max(those) > min(those) else 0.0,
+            ) for key, those in times.items()
+        }  # fmt: skip
 
     def test_attachments_are_read_by_name(self, recording: Path) -> None:
         assert read_attachment(recording, "note") == b"hello"

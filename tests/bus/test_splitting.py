@@ -84,6 +84,7 @@ def test_a_kill_between_two_parts_is_gone_on_from(path: Path) -> None:
     os.rename(part_path(path, 0), partial_path(part_path(path, 0)))
     assert parts_of(path) == {0: False, 1: False}
     again = SplitWriter(path, Split(seconds=0.5), PARTS, resume=True)
+    again.take_over()
     write(again, range(9, 12))
     assert not again.close()
     assert parts_of(path) == {0: True, 1: True}

@@ -16,6 +16,7 @@ import psutil
 import pytest
 from support.commands import command
 
+from fieldpose.bus.open_recording import unfinished_file
 from fieldpose.bus.reading import info
 from fieldpose.bus.topics import ALL
 from fieldpose.deploy.cli import main
@@ -48,9 +49,9 @@ def descendants() -> set[int]:
     return {process.pid for process in psutil.Process().children(recursive=True)}
 
 
-def pid_of(stage: str) -> int:
-    """The process of a stage below this one."""
-    for process in psutil.Process().children(recursive=True):
+def pid_of(stage: str, below: int | None = None) -> int:
+    """The process of a stage below a process, or this one."""
+    for process in psutil.Process(below).children(recursive=True):
         words = " ".join(process.cmdline()).split()
         if "stage" in words and words[words.index("stage") + 1] == stage:
             return process.pid
@@ -203,6 +204,43 @@ def test_ctrl_c_ends_every_process_within_5_s_and_leaves_a_finished_recording(tm
     assert {"frame", "truth", "state"} <= {topic.topic for topic in held.topics if topic.messages}
     assert [path.name for path in tmp_path.glob("*.partial")] == []
     assert json.loads(figures.read_text())["frames_sent"] > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("again", [False, True])
+def test_after_ctrl_c_a_slow_recorder_is_waited_for_unless_there_is_a_second_one(tmp_path: Path, again: bool) -> None:
+    recording = tmp_path / "run.mcap"
+    arguments = ["--source", f"mcap:{demo_file('sequence.mcap')}", "--guess", "train:047", "--rendering.size", "128"]
+    running = subprocess.Popen(
+        command("run", demo_file("field.safetensors"), *arguments, "--record", str(recording)),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert running.stderr is not None
+    for line in running.stderr:
+        if line.endswith("running\n"):
+            break
+    time.sleep(1.5)
+    recorder = psutil.Process(pid_of(RECORDER, running.pid))
+    # As one is whose disk takes longer than a heartbeat may be missing, once nobody looks for these any more.
+    running.send_signal(signal.SIGINT)
+    recorder.suspend()
+    with pytest.raises(subprocess.TimeoutExpired):
+        running.wait(timeout=8.0)
+    if again:
+        running.send_signal(signal.SIGINT)
+        assert running.wait(timeout=20) == 2
+        assert (
+            running.stderr.read().splitlines()[-1].startswith(f"fieldpose: {recording}: the recording was not finished")
+        )
+        assert unfinished_file(recording) is not None
+    else:
+        recorder.resume()
+        assert running.wait(timeout=20) == 130
+        assert info(recording).messages > 0
+        assert list(tmp_path.iterdir()) == [recording]
+    running.stderr.close()
 
 
 @pytest.mark.slow

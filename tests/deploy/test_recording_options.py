@@ -18,8 +18,10 @@ from fieldpose.bus.open_recording import partial_path
 from fieldpose.bus.ports import Outbox
 from fieldpose.bus.reading import info
 from fieldpose.bus.recorder import Recorder
+from fieldpose.bus.recording import RecordingWriter
 from fieldpose.bus.recovery import recover
 from fieldpose.bus.splitting import Split
+from fieldpose.bus.tee import Tee
 from fieldpose.bus.topics import ALL, STATE, Address
 from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus
 from fieldpose.deploy.cli import main
@@ -85,7 +87,7 @@ def test_without_the_extra_foxglove_is_refused(monkeypatch: pytest.MonkeyPatch) 
         RecordingOptions(format="foxglove").check(FILE)
 
 
-@pytest.mark.parametrize("name", ["run.mcap", "run.mcap.partial", "run-foxglove.mcap"])
+@pytest.mark.parametrize("name", ["run.mcap", "run.mcap.partial", "run.mcap.partial.before", "run-foxglove.mcap"])
 def test_no_recording_is_begun_where_a_file_is_in_the_way(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("somebody's")
     with pytest.raises(RecordingError, match=f"{name}: "):
@@ -116,6 +118,45 @@ def test_both_forms_are_recorded_at_once(tmp_path: Path) -> None:
     assert counts[0] == counts[1]
     assert counts[0]["/camera/image"] == 3
     assert info(foxglove).lossless
+
+
+class Failing(FoxgloveRecording):
+    """One whose disk fails at its end, on the way to it or by our own mistake."""
+
+    def close(self, *whys: Any, **named: Any) -> bool:
+        if not whys and not named:
+            raise self.failure
+        return super().close(*whys, **named)
+
+    failure: Exception = OSError(5, "Input/output error")
+
+
+@pytest.mark.parametrize("failure", [OSError(5, "Input/output error"), KeyError("x")])
+@pytest.mark.parametrize("first", [False, True])
+def test_of_both_forms_one_is_whole_where_the_other_fails_at_its_end(
+    tmp_path: Path, first: bool, failure: Exception
+) -> None:
+    whole, failing = RecordingWriter(tmp_path / "run.mcap"), Failing(tmp_path / "foxglove.mcap", ADDRESS, None)
+    failing.failure = failure
+    bus = MemoryBus()
+    recorder = Recorder(bus, ADDRESS, lambda: Tee([failing, whole] if first else [whole, failing]))
+    publish_everything(bus)
+    with pytest.raises(RecordingError, match=r"^\S*foxglove\.mcap: the recording ended early: [^;]*; [^;]*$"):
+        recorder.close()
+    assert info(tmp_path / "run.mcap").lossless
+    assert info(tmp_path / "foxglove.mcap").ended is not None
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_of_both_forms_one_is_whole_where_a_file_has_come_in_the_way_of_the_other(tmp_path: Path) -> None:
+    bus, path = MemoryBus(), tmp_path / "run.mcap"
+    recorder = Recorder(bus, ADDRESS, RecordingOptions(format="both").store(path, ADDRESS))
+    publish_everything(bus)
+    path.write_text("somebody's")
+    with pytest.raises(RecordingError, match="another file has come there; it is whole, as"):
+        recorder.close()
+    assert info(tmp_path / "run-foxglove.mcap").lossless
+    assert path.read_text() == "somebody's"
 
 
 @pytest.mark.parametrize("form", ["fieldpose", "foxglove"])
@@ -164,6 +205,7 @@ def test_a_killed_recording_in_foxgloves_form_is_recovered_and_gone_on_from(tmp_
     assert saved == killed.messages > 0
     assert len(read_mcap(tmp_path / "saved.mcap")["/camera/image"]) == 3
     again = FoxgloveRecording(path, ADDRESS, None, resume=True)
+    again.take_over()
     write_everything(again, range(3, 5))
     again.close()
     assert len(read_mcap(path)["/camera/image"]) == 5

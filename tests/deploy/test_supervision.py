@@ -83,6 +83,35 @@ def test_those_that_do_not_listen_are_killed_after_the_timeout(tmp_path: Path) -
         until(lambda: not psutil.pid_exists(pid))
 
 
+def test_who_is_in_a_hurry_waits_for_nobody(tmp_path: Path) -> None:
+    with Supervisor(tmp_path, [python("bad", STUBBORN, stop_s=60.0)]) as supervisor:
+        until(lambda: "up" in supervisor.last_line("bad"))
+        pid = supervisor.poll()["bad"].pid
+        asked: list[None] = []
+        assert not supervisor.stop(["bad"], timeout_s=60.0, hurry=lambda: asked.append(None) or len(asked) > 3)
+        until(lambda: not psutil.pid_exists(pid))
+    assert len(asked) == 4
+
+
+def test_what_ended_with_a_users_mistake_is_told_also_of_those_that_were_stopped(tmp_path: Path) -> None:
+    failing = (
+        "import signal, sys;"
+        f"signal.signal(signal.SIGTERM, lambda *_: print('fieldpose: no room') or sys.exit({USER_ERROR})); {SLEEP}"
+    )
+    programs = [
+        python("failing", failing),
+        python("good", SLEEP),
+        python("mistaken", f"raise SystemExit({USER_ERROR})"),
+    ]
+    with Supervisor(tmp_path, programs) as supervisor:
+        until(lambda: all("up" in supervisor.last_line(name) for name in ("failing", "good")))
+        until(lambda: supervisor.poll()["mistaken"].given_up)
+        assert supervisor.failure("failing") is None
+        assert supervisor.stop(["failing", "good"], timeout_s=20.0)
+        told = [supervisor.failure(name) for name in ("failing", "good", "mistaken")]
+    assert told == ["no room", None, "it said nothing"]
+
+
 def test_all_end_when_whoever_started_them_is_killed_and_no_temporary_folder_is_left(tmp_path: Path) -> None:
     folder = tmp_path / "temporary"
     folder.mkdir()

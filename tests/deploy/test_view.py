@@ -324,8 +324,9 @@ def one_line(capsys: pytest.CaptureFixture[str]) -> str:
 def test_what_cannot_be_shown_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["view", str(tmp_path / "no.mcap")]) == 2
     assert "cannot be read" in capsys.readouterr().err
-    assert main(["view", str(tmp_path / "run.mcap.partial")]) == 2
-    assert f"`fieldpose recover {tmp_path}/run.mcap.partial --out {tmp_path}/run.mcap` mends it" in one_line(capsys)
+    for name in ("run.mcap.partial", "run.mcap.partial.before"):
+        assert main(["view", str(tmp_path / name)]) == 2
+        assert f"`fieldpose recover {tmp_path}/{name} --out {tmp_path}/run.mcap` mends it" in one_line(capsys)
     assert main(["view", str(demo_file("sequence.mcap"))]) == 2
     assert "holds no field" in one_line(capsys)
     assert main(["view", str(demo_file("sequence.mcap")), "--field", str(demo_file("field.safetensors"))]) == 2

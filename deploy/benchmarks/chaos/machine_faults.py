@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from fieldpose.bus.messages import TrackingState
-from fieldpose.bus.open_recording import partial_path
+from fieldpose.bus.open_recording import unfinished_file
 from fieldpose.bus.reading import info
 from fieldpose.bus.recovery import recover
 from fieldpose.deploy.benchmarks.chaos.events import PAUSE_S, Event, Kind
@@ -105,8 +105,8 @@ def full(source: Path, followed: Followed) -> Played:
 
 def _readable(recording: Path, saved: Path) -> int:
     """How many messages a recording holds, or what can be saved of it."""
-    unfinished = partial_path(recording)
-    return recover(unfinished, saved) if unfinished.exists() else info(recording).messages
+    unfinished = unfinished_file(recording)
+    return info(recording).messages if unfinished is None else recover(unfinished, saved)
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import psutil
 
-from fieldpose.bus.open_recording import partial_path
+from fieldpose.bus.open_recording import unfinished_file
 from fieldpose.bus.recording import RecordingWriter
 from fieldpose.deploy.benchmarks.chaos.events import Event, Kind, Round
 from fieldpose.deploy.benchmarks.chaos.injector import SETTLED_S, Injector
@@ -117,7 +117,7 @@ def _left_behind(injector: Injector, recording: Path) -> list[str]:
         found += [f"folder left: {injector.folder}"] if injector.folder.exists() else []
     segments = [path for path in injector.segments if path.exists()]
     found += [f"{len(segments)} segments of shared memory left"] if segments else []
-    if partial_path(recording).exists():
+    if unfinished_file(recording) is not None:
         found.append("an unfinished recording is left")
     elif not recording.exists():
         found.append("no recording is left")

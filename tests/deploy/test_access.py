@@ -365,6 +365,8 @@ class TestKeysOfARun:
     @pytest.fixture(autouse=True)
     def base(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+        # Runs of the same user may be up meanwhile.
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
         return tmp_path / "fieldpose"
 
     def test_they_are_found_by_the_port_while_the_hub_lasts_and_nobody_else_can_read_them(self, base: Path) -> None:

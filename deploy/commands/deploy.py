@@ -79,7 +79,9 @@ class Options:
     def run(self) -> int:
         """Write them, and say what goes where."""
         site = self.site()
-        write_all(self.out, _WRITERS[self.kind](site, self.executable), self.again)
+        gone = write_all(self.out, _WRITERS[self.kind](site, self.executable), self.again)
+        if gone:
+            print(f"removed here, and to be disabled and removed on the hosts: {', '.join(gone)}")
         for line in _SAID[self.kind](self.out, site):
             print(line)
         return 0
@@ -151,14 +153,16 @@ def _for_compose(out: Path, site: Site) -> list[str]:
         f"{out}: compose.yaml and config/, to every host",
         _fields(site, "fields/ beside it on the hosts of those that read it"),
         f"fieldpose certs {out}/certs --hosts …: each host needs ca.pem and the files of the roles that it runs",
-        f"then, on each host, with those that it is to run: FIELDPOSE_HUB=tls/HOST:7447 docker compose up {names}",
+        f"then, on each host, with those that it is to run: FIELDPOSE_HUB=tls/HOST:7447 docker compose up"
+        f" --remove-orphans {names}",
     ]
 
 
 def _for_kubernetes(out: Path, site: Site) -> list[str]:
     return [
         f"fieldpose certs {out}/certs --hosts hub: become secrets, a role each",
-        f"kubectl apply -k {out}",
+        f"kubectl apply -k {out}; what a change has left, as after other --shares, goes by kubectl delete deployment"
+        " NAME: two that serve one pipeline answer each message twice",
         _fields(site, "the volume of the claim fields"),
     ]
 
@@ -169,7 +173,8 @@ def _for_systemd(out: Path, site: Site) -> list[str]:
         " config/* and hub.env to /etc/fieldpose, on every host; in hub.env stands where the hub is",
         _fields(site, FIELDS),
         "fieldpose certs certs --hosts …: of the roles that a host runs, to /var/lib/fieldpose/certs",
-        "then systemctl enable those that the host is to run, and systemctl start fieldpose.target",
+        f"then systemd-sysusers; systemctl daemon-reload; systemctl enable {systemd.TARGET} and those that the host"
+        f" is to run; systemctl start {systemd.TARGET}",
     ]
 
 

@@ -33,8 +33,8 @@ def files(site: Site) -> dict[str, bytes]:
 def _service(service: Service, site: Site) -> dict[str, Any]:
     made: dict[str, Any] = {
         "image": site.image,
-        "command": service.command(_HUB, TLS, site.shared_memory),
-        "environment": service.environment,
+        "command": [_literal(word) for word in service.command(_HUB, TLS, site.shared_memory)],
+        "environment": {name: _literal(value) for name, value in service.environment.items()},
         "user": _USER,
         # Peers listen on ports of their own choice, which other hosts must reach.
         "network_mode": "host",
@@ -51,10 +51,20 @@ def _service(service: Service, site: Site) -> dict[str, Any]:
         "secrets": [{"source": name, "target": f"{TLS}/{name}"} for name in service.certificates],
     }
     if service.device is not None:
-        made["devices"] = [f"{service.device}:{service.device}"]
+        made["devices"] = [_device(_literal(service.device))]
         made["group_add"] = ["video"]
     mounts = _mounts(service)
     return {**made, "volumes": mounts} if mounts else made
+
+
+def _literal(text: str) -> str:
+    """Without what Compose would take for a variable; the hub's is meant so."""
+    return text if text == _HUB else text.replace("$", "$$")
+
+
+def _device(path: str) -> str | dict[str, str]:
+    # In the short form colons part source, target and rights.
+    return {"source": path, "target": path, "permissions": "rw"} if ":" in path else f"{path}:{path}"
 
 
 def _mounts(service: Service) -> list[dict[str, Any]]:
@@ -64,7 +74,7 @@ def _mounts(service: Service) -> list[dict[str, Any]]:
     if service.with_fields:
         mounts.append(_bound("${FIELDPOSE_FIELDS:-./fields}", FIELDS))
     if service.reads is not None:
-        mounts.append(_bound(service.reads, service.reads))
+        mounts.append(_bound(_literal(service.reads), _literal(service.reads)))
     if service.writes:
         mounts.append({"type": "volume", "source": "state", "target": STATE})
     return mounts

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 from fieldpose.deploy.graph import HUB
 from fieldpose.deploy.hosts.services import CACHE, FIELDS, PORT, STATE, Service, Site
 
 _CERTIFICATES = f"{STATE}/certs"
 _HUB = "${FIELDPOSE_HUB}"
 TARGET = "fieldpose.target"
+_WORD = re.compile(r"[^\s\"'\\;]+")
+_PATH = re.compile(r"[^\s\"'\\:]+")
+"""Where a colon parts two paths."""
 _HARDENING = """NoNewPrivileges=yes
 CapabilityBoundingSet=
 AmbientCapabilities=
@@ -53,13 +58,14 @@ def _unit(service: Service, site: Site, executable: str) -> str:
     keys = "\n".join(f"LoadCredential={name}:{_CERTIFICATES}/{name}" for name in service.certificates)
     words = [executable, *service.command(_HUB, "%d", shared_memory=True)]
     command = " \\\n  ".join(_quoted(word) for word in words)
-    after = "network-online.target" if service.row.name == HUB else f"network-online.target fieldpose-{HUB}.service"
+    after = "network-online.target time-sync.target"
+    after += "" if service.row.name == HUB else f" fieldpose-{HUB}.service"
     return f"""{site.note}[Unit]
 Description=fieldpose {service.name}
 PartOf={TARGET}
-Wants=network-online.target
+Wants=network-online.target time-sync.target
 After={after}
-# However often it dies; 2 is what only people can mend.
+# However often it ends with an error: a hub that is away, a camera that is not plugged in, a clock that is not set yet.
 StartLimitIntervalSec=0
 
 [Service]
@@ -71,7 +77,6 @@ EnvironmentFile=/etc/fieldpose/hub.env
 ExecStart={command}
 Restart=on-failure
 RestartSec=1
-RestartPreventExitStatus=2
 TimeoutStopSec={service.stop_s:g}
 MemoryMax={service.memory_mb}M
 User=fieldpose
@@ -92,14 +97,22 @@ def _given(service: Service) -> str:
     if service.with_fields:
         lines.append(f"ReadOnlyPaths={FIELDS}")
     if service.reads is not None:
-        lines.append(f"BindReadOnlyPaths={service.reads}")
+        lines.append(f"BindReadOnlyPaths={_quoted(service.reads, _PATH)}")
     if service.device is None:
         return "\n".join([*lines, "PrivateDevices=yes"])
-    return "\n".join([*lines, "SupplementaryGroups=video", "DevicePolicy=closed", f"DeviceAllow={service.device} rw"])
+    return "\n".join(
+        [*lines, "SupplementaryGroups=video", "DevicePolicy=closed", f"DeviceAllow={_quoted(service.device, _PATH)} rw"]
+    )
 
 
-def _quoted(word: str) -> str:
-    # A dollar and a percent sign of a path would be taken for variables; the hub's and %d are meant so.
-    if word not in (_HUB, "%d"):
-        word = word.replace("%", "%%").replace("$", "$$")
-    return f'"{word}"' if " " in word else word
+def _quoted(word: str, plain: re.Pattern[str] = _WORD) -> str:
+    """As it stands in a unit: in quotes unless it is plain, and without what would be expanded there."""
+    # Of the hub's variable and %d just that is wanted.
+    if word in (_HUB, "%d"):
+        return word
+    word = word.replace("%", "%%")
+    word = word if plain is _PATH else word.replace("$", "$$")
+    if plain.fullmatch(word):
+        return word
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("\t", "\\t")
+    return f'"{escaped}"'

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
+import string
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,6 +20,7 @@ from fieldpose.deploy.cli import main, parse
 from fieldpose.deploy.commands import deploy, stage
 from fieldpose.deploy.commands.deploy import Options
 from fieldpose.deploy.graph import BY_NAME, CAMERA, HUB, RECORDER
+from fieldpose.deploy.hosts import compose, systemd
 from fieldpose.deploy.hosts.services import Site
 from fieldpose.deploy.processes.preload import pipelines_of
 from fieldpose.deploy.settings import read_settings
@@ -182,6 +185,37 @@ def test_what_was_changed_by_hand_is_not_overwritten_unless_asked(
     assert f"{unit}: is there already, and differs; give --again" in capsys.readouterr().err
     assert unit.read_text() == "mine"
     assert written("systemd", tmp_path / "site", field, "--source", "camera:0", "--again") == before
+
+
+def test_units_that_are_no_more_go_with_again_and_others_stay(
+    rig: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site = tmp_path / "site"
+    written("systemd", site, *rig, "--shares", "pnp=2")
+    mine = site / "fieldpose-mine.service"
+    mine.write_text("[Unit]\n")
+    assert main(["deploy", "systemd", str(site), *rig]) == 2
+    assert "give --again to remove it" in capsys.readouterr().err
+    written("systemd", site, *rig, "--again")
+    assert not list(site.glob("fieldpose-pnp-*.service"))
+    assert (site / "fieldpose-pnp.service").exists()
+    assert mine.exists()
+
+
+ODD = 'it\'s 100% of $HOME "a" \\ b.mp4'
+
+
+@pytest.mark.parametrize("device", ["/dev/video0", "/dev/v4l/by-path/pci-0000:00:14.0-usb"])
+def test_odd_names_come_through(device: str) -> None:
+    words = ("--camera.source", ODD, "plain", "$X", "50%")
+    unit = " ".join(systemd._quoted(word) for word in words)
+    read = [word.replace("%%", "%").replace("$$", "$") for word in shlex.split(unit)]
+    assert read == list(words)
+    assert systemd._quoted(device, systemd._PATH) == (f'"{device}"' if ":" in device else device)
+    for text in (*words, ODD):
+        assert string.Template(compose._literal(text)).substitute() == text
+    made = compose._device(device)
+    assert made == f"{device}:{device}" if ":" not in device else made["source"] == made["target"] == device
 
 
 def test_compose_reads_its_file(rig: list[str], tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from fieldpose.errors import DatasetError, GeometryError
@@ -37,7 +38,8 @@ def read_colmap(root: Path, model: Path, holdout: Holdout | None) -> Draft:
         raise DatasetError(f"{model}: the model has no image with a pose; map the images again")
     records = []
     for i, image in enumerate(images):
-        whole = [root / place / image.name for place in IMAGES if (root / place / image.name).is_file()]
+        # Of a name that no file can have it says that there is none.
+        whole = [root / place / image.name for place in IMAGES if os.path.isfile(root / place / image.name)]
         tails = (found for place in IMAGES if (found := find_image(root / place, image.name)) is not None)
         path = next(iter(whole), None) or next(tails, None)
         if path is None:

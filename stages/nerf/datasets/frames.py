@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -230,6 +231,6 @@ def _companion(file: Path, file_path: str | None) -> Path | None:
     if file_path is None:
         return None
     path = file.parent / file_path.replace("\\", "/")
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise DatasetError(f"{path}: no such file, but {file.name} lists it; restore it or take its entry out")
     return path

@@ -101,7 +101,11 @@ def test_what_is_missing_or_damaged_is_told(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no image 005\.png, but .*sparse/0 lists it"):
         load_dataset(tmp_path)
     model = tmp_path / "sparse/0/images.bin"
-    model.write_bytes(model.read_bytes()[:40])
+    whole = model.read_bytes()
+    model.write_bytes(whole.replace(b"005.png", b"0" * 300 + b".png"))
+    with pytest.raises(DatasetError, match=r"no image 0{300}\.png, but"):
+        load_dataset(tmp_path)
+    model.write_bytes(whole[:40])
     with pytest.raises(DatasetError, match="no COLMAP model that can be read"):
         load_dataset(tmp_path)
 

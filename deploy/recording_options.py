@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ _BYTES = {"kB": 1e3, "MB": 1e6, "GB": 1e9, "TB": 1e12, "KiB": 2**10, "MiB": 2**2
 _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0}
 _LEAST_PART_BYTES, _LEAST_PART_S = 1e6, 1.0
 
+START = "{start}"
 Form = Literal["fieldpose", "foxglove", "both"]
 
 
@@ -172,6 +174,11 @@ def recorded_files(record: Path, split: bool) -> list[Path]:
     if not split:
         return [record] if record.exists() else []
     return [part_path(record, number) for number, whole in parts_of(record).items() if whole]
+
+
+def with_start(record: Path, at: time.struct_time | None = None) -> Path:
+    """The file of a recorder that is started now, for START in its name: each start has a file of its own."""
+    return Path(str(record).replace(START, time.strftime("%Y%m%d-%H%M%S", at or time.localtime())))
 
 
 def unfinished_files(record: Path, split: bool) -> list[Path]:

@@ -99,11 +99,7 @@ def joint(hub: str, entry: Entry, names: Sequence[str], timeout_s: float = 0.0) 
     deadline = time.monotonic() + timeout_s
     told_s = time.monotonic() + min(timeout_s, _OPEN_S)
     while (local := keys_of(port_of(hub))) is None:
-        if (
-            time.monotonic() > told_s
-            and speaks_tls(host_of(hub), port_of(hub)) is False
-            and keys_of(port_of(hub)) is None
-        ):
+        if time.monotonic() > told_s and speaks_tls(host_of(hub), port_of(hub)) is False:
             raise TransportError(
                 f"{hub} is of no run of yours, and who listens there speaks no TLS: it is an open hub, which may be"
                 " anybody's and is joined with --open, or hangs"

@@ -98,7 +98,9 @@ class Options:
         wishes = Wishes(self.cores, shares, self.join, self.record, self.recording)
         carried = Carried(CONFIG, FIELDS)
         services = services_of(plans, wishes, carried)
-        return Site(services, carried.files, carried.fields, self.image, self.shared_memory, self._made_by())
+        site = Site(services, carried.files, carried.fields, self.image, self.shared_memory, self._made_by())
+        site.check_lines()
+        return site
 
     def _made_by(self) -> str:
         words = ["fieldpose", "deploy", self.kind, "DIR", *self.field]

@@ -38,7 +38,7 @@ from fieldpose.deploy.processes.lifeline import die_with_parent
 from fieldpose.deploy.processes.preload import field_of, pipelines_of
 from fieldpose.deploy.processes.threads import hold_to
 from fieldpose.deploy.processes.warmup import compile_kernels
-from fieldpose.deploy.recording_options import RecordingOptions
+from fieldpose.deploy.recording_options import RecordingOptions, with_start
 from fieldpose.deploy.settings import Settings
 from fieldpose.deploy.sharing import Share
 from fieldpose.errors import UsageError
@@ -76,7 +76,7 @@ class Options:
     processes that it exchanges messages with (default: any port, for this machine alone if the hub is on it)."""
     field: Annotated[Path | None, tyro.conf.arg(help=_FIELD)] = None
     record: Path | None = None
-    """The recorder's file (.mcap)."""
+    """The recorder's file (.mcap); {start} in its name becomes the time at which it is started."""
     recording: Annotated[RecordingOptions, tyro.conf.arg(name="record")] = dataclasses.field(
         default_factory=RecordingOptions
     )
@@ -155,7 +155,8 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     first = awaited if row.name != CAMERA else tuple(name for name in awaited if name.rpartition("/")[2] not in STAGES)
 
     try:
-        launch = Launch(bus, options.record, options.recording, plans, wait_until_ready)
+        record = None if options.record is None else with_start(options.record)
+        launch = Launch(bus, record, options.recording, plans, wait_until_ready)
         # A recorder is one for all.
         those = each[:1] if row.name == RECORDER else each
         handlers = [(make(parts, launch), parts.settings.address) for parts in those]

@@ -50,8 +50,9 @@ def _service(service: Service, site: Site) -> dict[str, Any]:
         "deploy": {"resources": {"limits": {"memory": f"{service.memory_mb}M"}}},
         "secrets": [{"source": name, "target": f"{TLS}/{name}"} for name in service.certificates],
     }
-    if service.device is not None:
-        made["devices"] = [_device(_literal(service.device))]
+    if service.container_device is not None:
+        device = _literal(service.container_device)
+        made["devices"] = [f"{device}:{device}"]
         made["group_add"] = ["video"]
     mounts = _mounts(service)
     return {**made, "volumes": mounts} if mounts else made
@@ -60,11 +61,6 @@ def _service(service: Service, site: Site) -> dict[str, Any]:
 def _literal(text: str) -> str:
     """Without what Compose would take for a variable; the hub's is meant so."""
     return text if text == _HUB else text.replace("$", "$$")
-
-
-def _device(path: str) -> str | dict[str, str]:
-    # In the short form colons part source, target and rights.
-    return {"source": path, "target": path, "permissions": "rw"} if ":" in path else f"{path}:{path}"
 
 
 def _mounts(service: Service) -> list[dict[str, Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fieldpose.deploy.graph import CAMERA, HUB
+from fieldpose.deploy.graph import HUB
 from fieldpose.deploy.hosts.services import CACHE, CONFIG, FIELDS, PORT, STATE, TLS, Service, Site
 from fieldpose.deploy.hosts.writing import to_yaml
 from fieldpose.errors import UsageError
@@ -115,7 +115,8 @@ def _pod(service: Service, site: Site) -> dict[str, Any]:
         "containers": [{
             "name": service.row.name,
             "image": site.image,
-            "args": service.command(_HUB, TLS, shared_memory=False),
+            # In an argument it would stand for a variable.
+            "args": [word.replace("$(", "$$(") for word in service.command(_HUB, TLS, shared_memory=False)],
             "env": [{"name": name, "value": value} for name, value in service.environment.items()],
             **({"ports": [{"name": "zenoh", "containerPort": PORT}]} if service.row.name == HUB else {}),
             "resources": {
@@ -150,8 +151,9 @@ def _volumes(service: Service) -> tuple[list[dict[str, Any]], list[dict[str, Any
         those.append(("fields", {"persistentVolumeClaim": {"claimName": "fields", "readOnly": True}}, FIELDS, True))
     if service.writes:
         those.append(("state", {"persistentVolumeClaim": {"claimName": "state"}}, STATE, False))
-    if service.row.name == CAMERA and service.device is not None:
-        those.append(("device", {"hostPath": {"path": service.device, "type": "CharDevice"}}, service.device, False))
+    device = service.container_device
+    if device is not None:
+        those.append(("device", {"hostPath": {"path": device, "type": "CharDevice"}}, device, False))
     if service.reads is not None:
         those.append(("source", {"hostPath": {"path": service.reads}}, service.reads, True))
     volumes = [{"name": name, **volume} for name, volume, _, _ in those]

@@ -14,7 +14,7 @@ from fieldpose.deploy.graph import BY_NAME, CAMERA, HUB, RECORDER, STAGES, Proce
 from fieldpose.deploy.hosts.carried import Carried
 from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.processes.programs import PIPELINES, Member, members
-from fieldpose.deploy.recording_options import RecordingOptions
+from fieldpose.deploy.recording_options import START, RecordingOptions
 from fieldpose.deploy.sharing import Share
 from fieldpose.errors import UsageError
 
@@ -25,6 +25,7 @@ TLS = "/run/fieldpose/tls"
 PORT = 7447
 EVERYWHERE = f"tls/0.0.0.0:{PORT}"
 _NOT_IN_NAMES = re.compile(r"[^a-z0-9]+")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 _MEMORY_MB = 2048
 """Far above what a process uses, for a limit is to save the host from one that has gone wrong."""
 _MORE_S = 5.0
@@ -69,6 +70,13 @@ class Service:
         return self.row.stop_s + _MORE_S
 
     @property
+    def container_device(self) -> str | None:
+        """The device that a container is given. Raises UsageError for one that cannot be named to its tools."""
+        if self.device is not None and ":" in self.device:
+            raise UsageError(f"{self.device}: containers take no device with a colon; see /dev/v4l/by-id, /dev/video*")
+        return self.device
+
+    @property
     def memory_mb(self) -> int:
         return _MEMORY_MB
 
@@ -99,6 +107,13 @@ class Site:
     def roles(self) -> list[str]:
         """Whose certificates are needed."""
         return list(dict.fromkeys(service.row.name for service in self.services))
+
+    def check_lines(self) -> None:
+        """Raise UsageError for what would end a line in the files, and so begin another of its own."""
+        words = (word for one in self.services for word in (*one.arguments, one.reads or "", one.device or ""))
+        for text in (self.made_by, self.image, *words):
+            if _CONTROL.search(text) is not None:
+                raise UsageError(f"{text!r}: has a control character, as the end of a line is; rename it")
 
     @property
     def note(self) -> str:
@@ -154,7 +169,7 @@ def _services(member: Member, files: tuple[str, str], plans: Sequence[Plan], wis
     arguments = ("stage", row.name, *reads, *(() if several else ("--field", path)), "--threads", str(threads))
     one = Service(name, row, arguments, threads)
     if row.name == RECORDER:
-        kept = (*(() if wishes.record is None else ("--record", str(wishes.record))),)
+        kept = () if wishes.record is None else ("--record", str(_at_each_start(wishes.record)))
         return [replace(one, arguments=(*arguments, *kept, *wishes.recording.arguments("record.")), writes=True)]
     if row.name == CAMERA:
         kind, _, rest = member.plans[0].settings.camera.source.partition(":")
@@ -166,6 +181,11 @@ def _services(member: Member, files: tuple[str, str], plans: Sequence[Plan], wis
     return [
         replace(one, name=f"{name}-{share.number}", arguments=(*arguments, "--share", str(share))) for share in shares
     ] or [one]
+
+
+def _at_each_start(record: Path) -> Path:
+    # No recording replaces a file, and services are started again after each reboot.
+    return record if START in record.name else record.with_stem(record.stem + f"-{START}")
 
 
 def _path_of(kind: str, rest: str) -> str:

@@ -114,5 +114,5 @@ def _quoted(word: str, plain: re.Pattern[str] = _WORD) -> str:
     word = word if plain is _PATH else word.replace("$", "$$")
     if plain.fullmatch(word):
         return word
-    escaped = word.replace("\\", "\\\\").replace('"', '\\"').replace("\t", "\\t")
+    escaped = word.replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'

@@ -330,6 +330,23 @@ class TestRefused:
             said = refused(with_scheme(address, "tls"), access_as(certificates, VIEWER), 2.0)
             assert "one that is open is joined with --open" in said
 
+    def test_an_open_hub_is_joined_by_those_who_ask_for_that_alone(self, certificates: Path) -> None:
+        address = f"tcp/127.0.0.1:{free_port()}"
+        said = r"is of no run of yours, .* speaks no TLS: .* joined with --open"
+        with (
+            a_hub(certificates, "--open", address=address),
+            joined(address, Entry(open=True), (), READY_S),
+            pytest.raises(TransportError, match=said),
+        ):
+            joint(address, Entry(), (VIEWER,))
+
+    def test_a_key_that_cannot_be_read_is_told_by_name(self, certificates: Path, tmp_path: Path) -> None:
+        folder = shutil.copytree(certificates, tmp_path / "certs")
+        key_of(folder, VIEWER).unlink()
+        key_of(folder, VIEWER).mkdir()
+        with pytest.raises(TransportError, match=rf"{VIEWER}\.key: cannot be read: Is a directory"):
+            access_as(folder, VIEWER)
+
     def test_a_stranger_neither_reads_nor_writes(self, hub: Hub, sessions: Callable[..., ZenohBus]) -> None:
         """Neither at the hub nor at a peer, whose own address it knows."""
         heard: list[bytes] = []

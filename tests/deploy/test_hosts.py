@@ -20,7 +20,6 @@ from fieldpose.deploy.cli import main, parse
 from fieldpose.deploy.commands import deploy, stage
 from fieldpose.deploy.commands.deploy import Options
 from fieldpose.deploy.graph import BY_NAME, CAMERA, HUB, RECORDER
-from fieldpose.deploy.hosts import compose, systemd
 from fieldpose.deploy.hosts.services import Site
 from fieldpose.deploy.processes.preload import pipelines_of
 from fieldpose.deploy.settings import read_settings
@@ -108,7 +107,7 @@ def test_each_process_of_the_graph_has_its_command_and_its_own_roles_certificate
         assert parse(stage.Options, "stage", here).entry.tls is not None
     assert "2/3" in made["matching-2"][0]
     assert made["hub"][0][2:4] == ["--listen", "tls/0.0.0.0:7447"]
-    assert "/var/lib/fieldpose/run.mcap" in made[RECORDER][0]
+    assert "/var/lib/fieldpose/run-{start}.mcap" in made[RECORDER][0]
     assert "--no-shared-memory" in made["pnp"][0] or kind == "systemd"
 
 
@@ -202,20 +201,53 @@ def test_units_that_are_no_more_go_with_again_and_others_stay(
     assert mine.exists()
 
 
-ODD = 'it\'s 100% of $HOME "a" \\ b.mp4'
+@pytest.mark.parametrize("kind", KINDS)
+def test_odd_names_come_through(kind: str, rig: list[str], tmp_path: Path) -> None:
+    film, record = """/films/it's 50% of $HOME $(A) "a" \\ ;#b.mp4""", "/var/lib/fieldpose/$(X) 1%.mcap"
+    field = save_empty_field(tmp_path / "$a 'b'.safetensors")
+    odd = [str(field), "--source", f"video:{film}", "--record", record]
+    files = written(kind, tmp_path / "site", *odd)
+    named = {"/srv/fieldpose/fields/$a 'b'.safetensors", "/var/lib/fieldpose/$(X) 1%-{start}.mcap"}
+    if kind == "systemd":
+        unit = files["fieldpose-recorder.service"].partition("ExecStart=")[2].partition("\nRestart=")[0]
+        words = [w.replace("%%", "%").replace("$$", "$") for w in shlex.split(unit.replace("\\\n", " "))]
+        (bound,) = re.findall("BindReadOnlyPaths=(.*)", files["fieldpose-camera.service"])
+        (reads,) = (word.replace("%%", "%") for word in shlex.split(bound))
+    elif kind == "compose":
+        made = yaml.safe_load(files["compose.yaml"])["services"]
+        words = [string.Template(word).safe_substitute() for word in made["recorder"]["command"]]
+        reads = string.Template(made["camera"]["volumes"][-1]["source"]).substitute()
+    else:
+        made = {one["metadata"]["name"]: one for one in yaml.safe_load_all(files["fieldpose.yaml"])
+                if one["kind"] == "Deployment"}  # fmt: skip
+        args = made["recorder"]["spec"]["template"]["spec"]["containers"][0]["args"]
+        # As Kubernetes does, for which $(X) is a variable.
+        words = [re.sub(r"(?<!\$)\$\((\w+)\)", "unknown", word).replace("$$", "$") for word in args]
+        volumes = made["camera"]["spec"]["template"]["spec"]["volumes"]
+        (reads,) = (v["hostPath"]["path"] for v in volumes if "hostPath" in v)
+    assert named <= set(words)
+    assert reads == film
 
 
-@pytest.mark.parametrize("device", ["/dev/video0", "/dev/v4l/by-path/pci-0000:00:14.0-usb"])
-def test_odd_names_come_through(device: str) -> None:
-    words = ("--camera.source", ODD, "plain", "$X", "50%")
-    unit = " ".join(systemd._quoted(word) for word in words)
-    read = [word.replace("%%", "%").replace("$$", "$") for word in shlex.split(unit)]
-    assert read == list(words)
-    assert systemd._quoted(device, systemd._PATH) == (f'"{device}"' if ":" in device else device)
-    for text in (*words, ODD):
-        assert string.Template(compose._literal(text)).substitute() == text
-    made = compose._device(device)
-    assert made == f"{device}:{device}" if ":" not in device else made["source"] == made["target"] == device
+@pytest.mark.parametrize("kind", ["compose", "kubernetes"])
+def test_a_device_that_containers_cannot_be_given_is_refused(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    field, device = str(save_empty_field(tmp_path / "f.safetensors")), "/dev/v4l/by-path/pci-0000:00:14.0-usb"
+    assert main(["deploy", kind, str(tmp_path / "site"), field, "--source", f"camera:{device}"]) == 2
+    assert f"{device}: containers take no device with a colon" in capsys.readouterr().err
+    assert not (tmp_path / "site").exists()
+    files = written("systemd", tmp_path / "site", field, "--source", f"camera:{device}")
+    assert f'DeviceAllow="{device}" rw' in files["fieldpose-camera.service"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_name_cannot_begin_a_line_of_its_own(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    field = str(save_empty_field(tmp_path / "f.safetensors"))
+    assert main(["deploy", kind, str(tmp_path / "site"), field, "--source", "video:/a\nUser=root\n.mp4"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "has a control character" in line
+    assert not (tmp_path / "site").exists()
 
 
 def test_compose_reads_its_file(rig: list[str], tmp_path: Path) -> None:

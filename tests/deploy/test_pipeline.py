@@ -176,13 +176,12 @@ def test_a_stage_killed_in_the_demo_comes_back_and_the_recording_is_whole(
     assert "from the recorded poses, rotation" in capsys.readouterr().out
 
 
-@pytest.mark.slow
-def test_ctrl_c_ends_every_process_within_5_s_and_leaves_a_finished_recording(tmp_path: Path) -> None:
-    recording, figures = tmp_path / "run.mcap", tmp_path / "run.json"
+def recorded_run(recording: Path, *options: object) -> subprocess.Popen[str]:
+    """A run of the demo's film, of which some is recorded already."""
     source = f"mcap:{demo_file('sequence.mcap')}"
-    arguments = ["--source", source, "--guess", "train:047", "--rendering.size", "128", "--record", str(recording)]
+    arguments = ["--source", source, "--guess", "train:047", "--rendering.size", "128", "--record", recording, *options]
     running = subprocess.Popen(
-        command("run", demo_file("field.safetensors"), *arguments, "--json", figures),
+        command("run", demo_file("field.safetensors"), *arguments),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
@@ -192,6 +191,13 @@ def test_ctrl_c_ends_every_process_within_5_s_and_leaves_a_finished_recording(tm
         if line.endswith("running\n"):
             break
     time.sleep(1.5)
+    return running
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_every_process_within_5_s_and_leaves_a_finished_recording(tmp_path: Path) -> None:
+    recording, figures = tmp_path / "run.mcap", tmp_path / "run.json"
+    running = recorded_run(recording, "--json", figures)
     processes = psutil.Process(running.pid).children(recursive=True)
     assert len(processes) >= len(BY_NAME) - 1
     began = time.monotonic()
@@ -210,18 +216,7 @@ def test_ctrl_c_ends_every_process_within_5_s_and_leaves_a_finished_recording(tm
 @pytest.mark.parametrize("again", [False, True])
 def test_after_ctrl_c_a_slow_recorder_is_waited_for_unless_there_is_a_second_one(tmp_path: Path, again: bool) -> None:
     recording = tmp_path / "run.mcap"
-    arguments = ["--source", f"mcap:{demo_file('sequence.mcap')}", "--guess", "train:047", "--rendering.size", "128"]
-    running = subprocess.Popen(
-        command("run", demo_file("field.safetensors"), *arguments, "--record", str(recording)),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert running.stderr is not None
-    for line in running.stderr:
-        if line.endswith("running\n"):
-            break
-    time.sleep(1.5)
+    running = recorded_run(recording)
     recorder = psutil.Process(pid_of(RECORDER, running.pid))
     # As one is whose disk takes longer than a heartbeat may be missing, once nobody looks for these any more.
     running.send_signal(signal.SIGINT)

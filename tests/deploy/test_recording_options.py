@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.foxglove.recording import FoxgloveRecording
 from fieldpose.deploy.processes.endpoints import free_port
-from fieldpose.deploy.recording_options import RecordingOptions
+from fieldpose.deploy.recording_options import RecordingOptions, with_start
 from fieldpose.errors import RecordingError, UsageError
 
 ADDRESS = Address("fieldpose", "mug", "cam")
@@ -263,3 +264,9 @@ def test_the_recorder_under_load_is_measured(tmp_path: Path) -> None:
     assert measured["parts"] > 1
     assert measured["rss_mb"]["highest"] > 0
     assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_each_start_of_a_recorder_has_a_file_of_its_own() -> None:
+    at = time.strptime("2031-02-03 04:05:06", "%Y-%m-%d %H:%M:%S")
+    assert with_start(Path("a/run-{start}.mcap"), at) == Path("a/run-20310203-040506.mcap")
+    assert with_start(Path("a/run.mcap"), at) == Path("a/run.mcap")

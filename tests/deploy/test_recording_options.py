@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import signal
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -11,6 +14,7 @@ from typing import Any
 
 import pytest
 from support import bus_samples
+from support.commands import command, save_empty_field
 from support.foxglove import read_mcap
 
 from fieldpose.bus.codec import encode
@@ -266,7 +270,22 @@ def test_the_recorder_under_load_is_measured(tmp_path: Path) -> None:
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_each_start_of_a_recorder_has_a_file_of_its_own() -> None:
+@pytest.mark.slow
+def test_a_recorder_that_is_started_again_has_a_file_of_its_own(hub: str, tmp_path: Path) -> None:
+    field, record = save_empty_field(tmp_path / "field.safetensors"), tmp_path / "run-{start}.mcap"
+    line = command("stage", "recorder", "--connect", hub, "--open", "--field", field, "--record", record)
+    for count in (1, 2):
+        recorder = subprocess.Popen(line)
+        while not list(tmp_path.glob("*.partial")) and recorder.poll() is None:
+            time.sleep(0.05)
+        recorder.send_signal(signal.SIGTERM)
+        assert recorder.wait(timeout=30) == 0
+        made = sorted(path.name for path in tmp_path.glob("run-*"))
+        assert len(made) == count
+        assert all(re.fullmatch(r"run-\d{8}-\d{6}\.mcap", name) for name in made)
+
+
+def test_the_start_of_a_recorder_stands_in_its_files_name() -> None:
     at = time.strptime("2031-02-03 04:05:06", "%Y-%m-%d %H:%M:%S")
     assert with_start(Path("a/run-{start}.mcap"), at) == Path("a/run-20310203-040506.mcap")
     assert with_start(Path("a/run.mcap"), at) == Path("a/run.mcap")

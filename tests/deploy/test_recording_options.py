@@ -28,7 +28,7 @@ from fieldpose.bus.recovery import recover
 from fieldpose.bus.splitting import Split
 from fieldpose.bus.tee import Tee
 from fieldpose.bus.topics import ALL, STATE, Address
-from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus
+from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus, wait_for
 from fieldpose.deploy.cli import main
 from fieldpose.deploy.foxglove.recording import FoxgloveRecording
 from fieldpose.deploy.processes.endpoints import free_port
@@ -276,8 +276,11 @@ def test_a_recorder_that_is_started_again_has_a_file_of_its_own(hub: str, tmp_pa
     line = command("stage", "recorder", "--connect", hub, "--open", "--field", field, "--record", record)
     for count in (1, 2):
         recorder = subprocess.Popen(line)
-        while not list(tmp_path.glob("*.partial")) and recorder.poll() is None:
-            time.sleep(0.05)
+        bus = ZenohBus(hub)
+        try:
+            wait_for(bus, Address(), ["recorder"], 60.0)
+        finally:
+            bus.close()
         recorder.send_signal(signal.SIGTERM)
         assert recorder.wait(timeout=30) == 0
         made = sorted(path.name for path in tmp_path.glob("run-*"))

@@ -69,6 +69,10 @@ def test_each_event_must_be_told_and_nothing_else() -> None:
     assert (tracking.away_s, tracking.back_s, tracking.without_pose) == (3.0, pytest.approx(0.5), 70)
     (only,) = judged(done[1:2], seen, [])
     assert only.problems == ["not reported"]
+    (starved,) = judged(done[1:2], seen, [replace(told[1], silent_ns=2 * SECOND, back_ns=9 * SECOND)])
+    assert starved.problems == []
+    (before,) = judged(done[1:2], seen, [replace(told[1], silent_ns=2 * SECOND, back_ns=4 * SECOND)])
+    assert before.problems == ["not reported", "reported though nothing was done to it: tracking hung"]
     (other,) = judged(done[1:2], seen, [replace(told[1], what="ended")])
     assert other.problems == ["reported as ended"]
     (false,) = judged(done[:1], seen, [*told, Fault("pnp", "hung", 3 * SECOND)])

@@ -17,8 +17,8 @@ from fieldpose.stages.geometry import Limit, rotation_error_deg, translation_err
 
 IN_TIME_S = 2.0
 _STEADY_S, _STEADY_SHARE, _STEADY_FRAMES = 0.5, 0.8, 5
-_LATE_NS = 1_000_000_000
-"""A fault may be noticed as much earlier or later than it was brought about: a heartbeat, and a look."""
+_LATE_NS = 5_000_000_000
+"""A last sign of life may be heard as long after an event as the machine keeps the looks away from it."""
 
 
 @dataclass
@@ -132,8 +132,9 @@ def _untold(done: Done, faults: list[Fault]) -> list[str]:
     event = done.event
     gone_ns = done.gone_ns or done.at_ns
     for fault in faults:
-        near = done.at_ns - _LATE_NS <= fault.silent_ns <= gone_ns + _LATE_NS
-        if fault.process == event.process and near:
+        # It may have been silent for long before, on a machine with other work.
+        around = fault.silent_ns <= gone_ns + _LATE_NS and (fault.back_ns is None or fault.back_ns >= done.at_ns)
+        if fault.process == event.process and around:
             faults.remove(fault)
             expected = "ended" if event.kind is Kind.KILL else "hung"
             return [] if fault.what == expected else [f"reported as {fault.what}"]

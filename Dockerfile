@@ -27,7 +27,8 @@ RUN apt-get update \
     && rm -rf /var/lib/apt/lists/* \
     && groupadd --gid 1000 fieldpose \
     && useradd --uid 1000 --gid 1000 --no-create-home --home-dir /var/lib/fieldpose --shell /usr/sbin/nologin fieldpose \
-    && install -d -o fieldpose -g fieldpose /var/lib/fieldpose /var/cache/fieldpose \
+    # Volumes begin with these modes, and may be of a site that runs its containers as another user.
+    && install -d -m 1777 /var/lib/fieldpose /var/cache/fieldpose \
     && install -d /etc/fieldpose /srv/fieldpose/fields
 COPY --from=build /opt/fieldpose /opt/fieldpose
 ENV PATH=/opt/fieldpose/bin:$PATH PYTHONUNBUFFERED=1 PYTHONDONTWRITEBYTECODE=1 \

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tempfile
 import time
@@ -103,6 +104,11 @@ class RecordingOptions:
             return None
         return SnapshotConfig(self.snapshots, seconds_of(self.ring, "ring"), self._ring_bytes(), self.when_lost)
 
+    @property
+    def most_memory_mb(self) -> int:
+        """What snapshots take at most. Raises UsageError."""
+        return 0 if self.snapshots is None else math.ceil(2 * self._ring_bytes() / 1e6)
+
     def keep(self, metadata: Metadata | None = None, attachments: Iterable[Attachment] = ()) -> Snapshots | None:
         """What keeps the last messages, where that is wanted. Raises UsageError."""
         config = self.snapshot_config()
@@ -143,7 +149,7 @@ class RecordingOptions:
         """These options as a command line gives them, each with `prefix` in its name."""
         words = [f"--{prefix}format", self.format, f"--{prefix}ring", self.ring, f"--{prefix}ring-size", self.ring_size]
         words += [] if self.split is None else [f"--{prefix}split", self.split]
-        words += [] if self.snapshots is None else [f"--{prefix}snapshots", str(self.snapshots.resolve())]
+        words += [] if self.snapshots is None else [f"--{prefix}snapshots", str(self.snapshots.absolute())]
         return [*words, f"--{prefix}{'' if self.when_lost else 'no-'}when-lost"]
 
     def _check_room(self, attached: int) -> None:

@@ -42,17 +42,16 @@ def cached_njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def cache_folder(folder: Path) -> Path | None:
     """Where the kernels of a folder are cached, None where nothing can be written: then each process compiles them.
 
-    In numba.config.CACHE_DIR, if it is set, else beside them, else in the user's cache, else in the user's own folder
-    for what is temporary.
+    The first that can be written of numba.config.CACHE_DIR, if it is set, their own folder, the user's cache, and the
+    user's own folder for what is temporary.
     """
     name = f"kernels-{_state_of_folder(folder)}"
-    if numba.config.CACHE_DIR:
-        return Path(numba.config.CACHE_DIR) / name
-    found = next((place for place in _places(folder) if _is_writable(place)), None)
-    return None if found is None else found / name
+    return next((place / name for place in _places(folder) if _is_writable(place / name)), None)
 
 
 def _places(folder: Path) -> Iterator[Path]:
+    if numba.config.CACHE_DIR:
+        yield Path(numba.config.CACHE_DIR)
     yield folder / "__pycache__"
     with suppress(RuntimeError):  # no home
         yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "fieldpose"

@@ -206,5 +206,6 @@ def _readable(path: Path) -> bool:
     except FileNotFoundError:
         return False
     except OSError as error:
-        raise TransportError(f"{path}: cannot be read: {error.strerror}") from error
+        whose = f" (this process is of user {os.getuid()})" if isinstance(error, PermissionError) else ""
+        raise TransportError(f"{path}: cannot be read{whose}: {error.strerror}") from error
     return True

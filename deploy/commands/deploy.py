@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from fieldpose.errors import UsageError
 
 Kind = Literal["compose", "kubernetes", "systemd"]
 _MOST_CORES = 1024
+_LABEL = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
 
 
 @dataclass(frozen=True)
@@ -60,8 +62,10 @@ class Options:
     """systemd: where `fieldpose` is on the hosts."""
     shared_memory: bool = False
     """compose: containers of one host exchange images through its /dev/shm."""
+    namespace: str = "fieldpose"
+    """kubernetes: the namespace of everything."""
     record: Path | None = None
-    """The recorder's file, below /var/lib/fieldpose."""
+    """The recorder's file, a path below /var/lib/fieldpose, or a name in it."""
     recording: Annotated[RecordingOptions, tyro.conf.arg(name="record")] = dataclasses.field(
         default_factory=RecordingOptions
     )
@@ -90,6 +94,12 @@ class Options:
         """What is written. Raises UsageError, ConfigError and FieldFileError."""
         if not 1 <= self.cores <= _MOST_CORES:
             raise UsageError(f"--cores {self.cores}: expected 1 to {_MOST_CORES}")
+        if not self.executable.startswith("/"):
+            raise UsageError(
+                f"--executable {self.executable}: expected the whole path that it has on the hosts, from /"
+            )
+        if not _LABEL.fullmatch(self.namespace):
+            raise UsageError(f"--namespace {self.namespace}: expected small letters, digits and hyphens, at most 63")
         for other in self.join:
             checked_endpoint(other)
         plans = planned_rig(self.settings, read_rig(self.config)[1], self.field, self.source)
@@ -98,7 +108,8 @@ class Options:
         wishes = Wishes(self.cores, shares, self.join, self.record, self.recording)
         carried = Carried(CONFIG, FIELDS)
         services = services_of(plans, wishes, carried)
-        site = Site(services, carried.files, carried.fields, self.image, self.shared_memory, self._made_by())
+        made_by = self._made_by()
+        site = Site(services, carried.files, carried.fields, self.image, self.shared_memory, made_by, self.namespace)
         site.check_lines()
         return site
 
@@ -110,7 +121,7 @@ class Options:
             words += (
                 [word for one in given for word in ("--source", one)] if apart else [f"--{name}", *given] * bool(given)
             )
-        for name in ("cores", "image", "executable", "record", "config"):
+        for name in ("cores", "image", "executable", "namespace", "record", "config"):
             if getattr(self, name) != _default(name):
                 words += [f"--{name}", str(getattr(self, name))]
         words += ["--shared-memory"] * self.shared_memory
@@ -154,17 +165,20 @@ def _for_compose(out: Path, site: Site) -> list[str]:
     return [
         f"{out}: compose.yaml and config/, to every host",
         _fields(site, "fields/ beside it on the hosts of those that read it"),
-        f"fieldpose certs {out}/certs --hosts …: each host needs ca.pem and the files of the roles that it runs",
+        f"fieldpose certs {out}/certs --hosts …: each host needs ca.pem and the files of the roles that it runs, of the"
+        " user that the containers are: 1000, or the UID:GID in FIELDPOSE_USER",
         f"then, on each host, with those that it is to run: FIELDPOSE_HUB=tls/HOST:7447 docker compose up"
         f" --remove-orphans {names}",
     ]
 
 
 def _for_kubernetes(out: Path, site: Site) -> list[str]:
+    films = " ".join(service.name for service in site.services if service.reads is not None)
     return [
         f"fieldpose certs {out}/certs --hosts hub: become secrets, a role each",
         f"kubectl apply -k {out}; what a change has left, as after other --shares, goes by kubectl delete deployment"
         " NAME: two that serve one pipeline answer each message twice",
+        *([f"a camera of files is a job, to be deleted before it is applied again: {films}"] if films else []),
         _fields(site, "the volume of the claim fields"),
     ]
 

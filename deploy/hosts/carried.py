@@ -11,8 +11,8 @@ from fieldpose.deploy.plan import Plan
 from fieldpose.deploy.settings import to_json
 from fieldpose.errors import ConfigError, UsageError
 
-_MOST_BYTES = 1 << 20
-"""What a ConfigMap of Kubernetes can hold."""
+_MOST_BYTES = 1_000_000
+"""What a ConfigMap of Kubernetes can hold of all files together, 1 MiB, less what it says of them."""
 
 
 class Carried:
@@ -50,11 +50,12 @@ class Carried:
         return f"{self._fields}/{name}"
 
     def add(self, name: str, content: bytes) -> None:
-        """Take in a file. Raises UsageError where another has its name, or it is too large."""
+        """Take in a file. Raises UsageError where another has its name, or all together are too large."""
         if self.files.setdefault(name, content) != content:
             raise UsageError(f"two files named {name} would be needed; rename one of them")
-        if len(content) > _MOST_BYTES:
-            raise UsageError(f"{name}: {len(content)} bytes are more than a file of settings may have, {_MOST_BYTES}")
+        size = sum(map(len, self.files.values()))
+        if size > _MOST_BYTES:
+            raise UsageError(f"{name}: with it the files that settings name have {size} bytes, at most {_MOST_BYTES}")
 
     def _with_files(self, config: Any) -> Any:
         """Settings with the files that they name, wherever in the tree, where the hosts have them."""

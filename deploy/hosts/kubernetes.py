@@ -10,12 +10,14 @@ from fieldpose.deploy.hosts.writing import to_yaml
 from fieldpose.errors import UsageError
 
 _HUB = f"tls/{HUB}:{PORT}"
-_NAMESPACE, _CONFIG_MAP = "fieldpose", "fieldpose-config"
+_CONFIG_MAP = "fieldpose-config"
 _PART_OF = {"app.kubernetes.io/part-of": "fieldpose"}
 _NODE_OF_CAMERA = "fieldpose/camera"
 _USER, _VIDEO = 1000, 44
 _READ_BY_GROUP = 0o440
 _FIELDS_GB, _STATE_GB = 5, 50
+_MOST_RETRIES = 100
+"""Of a camera of files, while the hub is not there yet; the waits grow to five minutes."""
 
 
 def files(site: Site) -> dict[str, bytes]:
@@ -23,11 +25,11 @@ def files(site: Site) -> dict[str, bytes]:
     if site.shared_memory:
         raise UsageError("pods do not share /dev/shm; leave out --shared-memory")
     documents = [
-        {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": _NAMESPACE}},
+        {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": site.namespace}},
         *_claims(site),
         _service_of_hub(),
-        _network_policy(),
-        *(_deployment(service, site) for service in site.services),
+        *_network_policies(),
+        *(_workload(service, site) for service in site.services),
     ]
     return {
         "kustomization.yaml": site.note.encode() + to_yaml(_kustomization(site)),
@@ -41,7 +43,7 @@ def _kustomization(site: Site) -> dict[str, Any]:
     return {
         "apiVersion": "kustomize.config.k8s.io/v1beta1",
         "kind": "Kustomization",
-        "namespace": _NAMESPACE,
+        "namespace": site.namespace,
         "resources": ["fieldpose.yaml"],
         "configMapGenerator": [{"name": _CONFIG_MAP, "files": [f"config/{name}" for name in site.files]}],
         "secretGenerator": [
@@ -73,29 +75,41 @@ def _service_of_hub() -> dict[str, Any]:
     return {"apiVersion": "v1", "kind": "Service", "metadata": {"name": HUB, "labels": _PART_OF}, "spec": spec}
 
 
-def _network_policy() -> dict[str, Any]:
+def _network_policies() -> list[dict[str, Any]]:
     # Whatever else runs in the cluster has no business at their ports, though it would have no certificate either.
-    own = [{"podSelector": {"matchLabels": _PART_OF}}]
-    spec = {"podSelector": {"matchLabels": _PART_OF}, "policyTypes": ["Ingress"], "ingress": [{"from": own}]}
-    about = {"name": "fieldpose", "labels": _PART_OF}
+    own = {"podSelector": {"matchLabels": _PART_OF}}
+    # Hubs of other groups, which may be in namespaces of their own.
+    others = {"namespaceSelector": {}, "podSelector": {"matchLabels": {"app.kubernetes.io/name": HUB, **_PART_OF}}}
+    port = [{"port": PORT, "protocol": "TCP"}]
+    return [
+        _policy("fieldpose", _PART_OF, {"from": [own]}),
+        _policy("fieldpose-hubs", {"app.kubernetes.io/name": HUB, **_PART_OF}, {"from": [others], "ports": port}),
+    ]
+
+
+def _policy(name: str, labels: dict[str, str], ingress: dict[str, Any]) -> dict[str, Any]:
+    spec = {"podSelector": {"matchLabels": labels}, "policyTypes": ["Ingress"], "ingress": [ingress]}
+    about = {"name": name, "labels": _PART_OF}
     return {"apiVersion": "networking.k8s.io/v1", "kind": "NetworkPolicy", "metadata": about, "spec": spec}
 
 
-def _deployment(service: Service, site: Site) -> dict[str, Any]:
+def _workload(service: Service, site: Site) -> dict[str, Any]:
+    """A deployment; a job where it ends by itself, as a camera of files does."""
     labels = {"app.kubernetes.io/name": service.name, **_PART_OF}
+    about = {"name": service.name, "labels": labels}
+    template = {"metadata": {"labels": labels}, "spec": _pod(service, site)}
+    if service.reads is not None:
+        template["spec"]["restartPolicy"] = "OnFailure"
+        spec: dict[str, Any] = {"backoffLimit": _MOST_RETRIES, "template": template}
+        return {"apiVersion": "batch/v1", "kind": "Job", "metadata": about, "spec": spec}
     spec = {
         "replicas": 1,
         # Never two that would answer the same message; more hosts take shares of their own.
         "strategy": {"type": "Recreate"},
         "selector": {"matchLabels": labels},
-        "template": {"metadata": {"labels": labels}, "spec": _pod(service, site)},
+        "template": template,
     }
-    return {
-        "apiVersion": "apps/v1",
-        "kind": "Deployment",
-        "metadata": {"name": service.name, "labels": labels},
-        "spec": spec,
-    }
+    return {"apiVersion": "apps/v1", "kind": "Deployment", "metadata": about, "spec": spec}
 
 
 def _pod(service: Service, site: Site) -> dict[str, Any]:

@@ -26,7 +26,7 @@ PORT = 7447
 EVERYWHERE = f"tls/0.0.0.0:{PORT}"
 _NOT_IN_NAMES = re.compile(r"[^a-z0-9]+")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
-_MEMORY_MB = 2048
+MEMORY_MB = 2048
 """Far above what a process uses, for a limit is to save the host from one that has gone wrong."""
 _MORE_S = 5.0
 _SOURCES_OF_FILES = ("folder", "dataset", "video", "mcap", "bag")
@@ -37,7 +37,7 @@ class Service:
     """A process on whichever host.
 
     arguments: of `fieldpose`, but for how it joins the hub; device: of a camera; reads: a file or folder of its host
-    that its frames come from; writes: whether it keeps recordings.
+    that its frames come from; writes: whether it keeps recordings; memory_mb: at most.
     """
 
     name: str
@@ -47,6 +47,7 @@ class Service:
     device: str | None = None
     reads: str | None = None
     writes: bool = False
+    memory_mb: int = MEMORY_MB
 
     @property
     def environment(self) -> dict[str, str]:
@@ -76,10 +77,6 @@ class Service:
             raise UsageError(f"{self.device}: containers take no device with a colon; see /dev/v4l/by-id, /dev/video*")
         return self.device
 
-    @property
-    def memory_mb(self) -> int:
-        return _MEMORY_MB
-
     def command(self, hub: str, tls: str, shared_memory: bool) -> list[str]:
         """Its arguments, with the hub's address and the folder of its certificates."""
         if self.row.name == HUB:
@@ -93,7 +90,7 @@ class Site:
     """Everything that is written down.
 
     files: the settings, by their names in CONFIG; fields: the files of fields, by their names in FIELDS; made_by: the
-    command line that writes all this.
+    command line that writes all this; namespace: of Kubernetes.
     """
 
     services: tuple[Service, ...]
@@ -102,6 +99,7 @@ class Site:
     image: str
     shared_memory: bool
     made_by: str
+    namespace: str = "fieldpose"
 
     @property
     def roles(self) -> list[str]:
@@ -169,8 +167,7 @@ def _services(member: Member, files: tuple[str, str], plans: Sequence[Plan], wis
     arguments = ("stage", row.name, *reads, *(() if several else ("--field", path)), "--threads", str(threads))
     one = Service(name, row, arguments, threads)
     if row.name == RECORDER:
-        kept = () if wishes.record is None else ("--record", str(_at_each_start(wishes.record)))
-        return [replace(one, arguments=(*arguments, *kept, *wishes.recording.arguments("record.")), writes=True)]
+        return [_recording(one, wishes)]
     if row.name == CAMERA:
         kind, _, rest = member.plans[0].settings.camera.source.partition(":")
         device = (f"/dev/video{rest}" if rest.isdigit() else rest) if kind == "camera" else None
@@ -181,6 +178,24 @@ def _services(member: Member, files: tuple[str, str], plans: Sequence[Plan], wis
     return [
         replace(one, name=f"{name}-{share.number}", arguments=(*arguments, "--share", str(share))) for share in shares
     ] or [one]
+
+
+def _recording(recorder: Service, wishes: Wishes) -> Service:
+    kept = () if wishes.record is None else ("--record", str(_at_each_start(_below_state(wishes.record, "--record"))))
+    options, needed_mb = wishes.recording, MEMORY_MB
+    if options.snapshots is not None:
+        options = replace(options, snapshots=_below_state(options.snapshots, "--record.snapshots"))
+        needed_mb += options.most_memory_mb
+    arguments = (*recorder.arguments, *kept, *options.arguments("record."))
+    return replace(recorder, arguments=arguments, writes=True, memory_mb=needed_mb)
+
+
+def _below_state(path: Path, option: str) -> Path:
+    """Where a service can write. Raises UsageError for a path elsewhere."""
+    whole = STATE / path
+    if ".." in path.parts or not whole.is_relative_to(STATE) or whole == Path(STATE):
+        raise UsageError(f"{option} {path}: services write below {STATE} alone; give a path there, or a name in it")
+    return whole
 
 
 def _at_each_start(record: Path) -> Path:

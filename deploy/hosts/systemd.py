@@ -56,8 +56,9 @@ def unit_name(service: Service) -> str:
 def _unit(service: Service, site: Site, executable: str) -> str:
     environment = "\n".join(f"Environment={name}={value}" for name, value in service.environment.items())
     keys = "\n".join(f"LoadCredential={name}:{_CERTIFICATES}/{name}" for name in service.certificates)
-    words = [executable, *service.command(_HUB, "%d", shared_memory=True)]
-    command = " \\\n  ".join(_quoted(word) for word in words)
+    words = service.command(_HUB, "%d", shared_memory=True)
+    # In the program itself no variable is expanded.
+    command = " \\\n  ".join([_quoted(executable, _PATH), *map(_quoted, words)])
     after = "network-online.target time-sync.target"
     after += "" if service.row.name == HUB else f" fieldpose-{HUB}.service"
     return f"""{site.note}[Unit]

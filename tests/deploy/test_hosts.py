@@ -9,6 +9,7 @@ import string
 import subprocess
 import sys
 from collections.abc import Iterator
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def services_of(kind: str, files: dict[str, str]) -> dict[str, tuple[list[str], 
                for one in yaml.safe_load(files["kustomization.yaml"])["secretGenerator"]}  # fmt: skip
     found = {}
     for (kind_of, name), one in documents.items():
-        if kind_of == "Deployment":
+        if kind_of in ("Deployment", "Job"):
             pod = one["spec"]["template"]["spec"]
             given = [v["secret"]["secretName"] for v in pod["volumes"] if "secret" in v]
             found[name] = (pod["containers"][0]["args"], set().union(*(secrets[secret] for secret in given)))
@@ -160,6 +161,11 @@ def test_containers_that_share_memory_have_one_dev_shm(tmp_path: Path, capsys: p
         (["--source", "video:film.mp4"], "give the whole path that it has on the camera's host"),
         (["--join", "robot"], "'robot' is no address of a hub"),
         (["--cores", "0"], "--cores 0: expected 1 to 1024"),
+        (["--record", "/data/run.mcap"], "--record /data/run.mcap: services write below /var/lib/fieldpose alone"),
+        (["--record", "../run.mcap"], "--record ../run.mcap: services write below /var/lib/fieldpose alone"),
+        (["--record.snapshots", "/tmp"], "--record.snapshots /tmp: services write below /var/lib/fieldpose alone"),
+        (["--executable", "fieldpose"], "--executable fieldpose: expected the whole path that it has on the hosts"),
+        (["--namespace", "My_robots"], "--namespace My_robots: expected small letters, digits and hyphens"),
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(
@@ -202,15 +208,80 @@ def test_units_that_are_no_more_go_with_again_and_others_stay(
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_a_recorder_writes_where_it_may_and_has_the_memory_for_its_ring(kind: str, tmp_path: Path) -> None:
+    field = str(save_empty_field(tmp_path / "f.safetensors"))
+    kept = ["--record", "run.mcap", "--record.snapshots", "lost", "--record.ring-size", "3GB"]
+    files = written(kind, tmp_path / "site", field, "--source", "bus", *kept)
+    words, _ = services_of(kind, files)["recorder"]
+    assert "/var/lib/fieldpose/run-{start}.mcap" in words
+    assert "/var/lib/fieldpose/lost" in words
+    limits = re.findall(r"(?:memory: |MemoryMax=)(\d+)M", "\n".join(files.values()))
+    assert set(limits) >= {"2048", "8048"}
+
+
+def test_a_camera_of_files_is_a_job_and_another_groups_hub_is_let_in(
+    rig: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = written("kubernetes", tmp_path / "site", *rig, "--namespace", "cell-2")
+    assert "to be deleted before it is applied again: camera-left\n" in capsys.readouterr().out
+    made = list(yaml.safe_load_all(files["fieldpose.yaml"]))
+    kinds = {one["metadata"]["name"]: one["kind"] for one in made if one["kind"] in ("Deployment", "Job")}
+    assert [name for name, kind in kinds.items() if kind == "Job"] == ["camera-left"]
+    (film,) = (one["spec"] for one in made if one["kind"] == "Job")
+    assert film["template"]["spec"]["restartPolicy"] == "OnFailure"
+    assert [one["metadata"]["name"] for one in made if one["kind"] == "Namespace"] == ["cell-2"]
+    assert yaml.safe_load(files["kustomization.yaml"])["namespace"] == "cell-2"
+    (hubs,) = (one["spec"] for one in made if one["metadata"]["name"] == "fieldpose-hubs")
+    (ingress,) = hubs["ingress"]
+    assert ingress["from"][0]["namespaceSelector"] == {}
+    assert ingress["from"][0]["podSelector"] == hubs["podSelector"]
+
+
+def test_files_beyond_what_a_config_map_holds_are_refused(
+    rig: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    camera = tmp_path / "left.json"
+    camera.write_text(camera.read_text() + " " * 999_000)
+    assert main(["deploy", "kubernetes", str(tmp_path / "site"), *rig]) == 2
+    assert "the files that settings name have 1" in capsys.readouterr().err
+    assert not (tmp_path / "site").exists()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_printed_names_all_that_was_written(
+    kind: str, rig: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    site = tmp_path / "site"
+    files = written(kind, site, *rig)
+    said = capsys.readouterr().out
+    named = {name for name in files if any(fnmatch(name, word.strip(",:;")) for word in said.split())}
+    if kind == "kubernetes":
+        assert f"kubectl apply -k {site};" in said
+        kustomization = yaml.safe_load(files["kustomization.yaml"])
+        named = {"kustomization.yaml", *kustomization["resources"], *kustomization["configMapGenerator"][0]["files"]}
+        assert main(["certs", str(site / "certs"), "--hosts", "hub"]) == 0
+        assert all((site / name).is_file() for one in kustomization["secretGenerator"] for name in one["files"])
+    elif kind == "compose":
+        named |= {name for name in files if name.startswith("config/")}
+        up = said.partition("--remove-orphans ")[2].split("\n")[0].split()
+        assert up == list(yaml.safe_load(files["compose.yaml"])["services"])
+    assert named == set(files)
+    assert all(f"{tmp_path}/{name}.safetensors" in said for name in ("lamp", "can"))
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_odd_names_come_through(kind: str, rig: list[str], tmp_path: Path) -> None:
     film, record = """/films/it's 50% of $HOME $(A) "a" \\ ;#b.mp4""", "/var/lib/fieldpose/$(X) 1%.mcap"
     field = save_empty_field(tmp_path / "$a 'b'.safetensors")
-    odd = [str(field), "--source", f"video:{film}", "--record", record]
+    executable = "/opt/$x 1%/fieldpose"
+    odd = [str(field), "--source", f"video:{film}", "--record", record, "--executable", executable]
     files = written(kind, tmp_path / "site", *odd)
     named = {"/srv/fieldpose/fields/$a 'b'.safetensors", "/var/lib/fieldpose/$(X) 1%-{start}.mcap"}
     if kind == "systemd":
         unit = files["fieldpose-recorder.service"].partition("ExecStart=")[2].partition("\nRestart=")[0]
-        words = [w.replace("%%", "%").replace("$$", "$") for w in shlex.split(unit.replace("\\\n", " "))]
+        program, *given = shlex.split(unit.replace("\\\n", " "))
+        assert program.replace("%%", "%") == executable
+        words = [word.replace("%%", "%").replace("$$", "$") for word in given]
         (bound,) = re.findall("BindReadOnlyPaths=(.*)", files["fieldpose-camera.service"])
         (reads,) = (word.replace("%%", "%") for word in shlex.split(bound))
     elif kind == "compose":
@@ -219,7 +290,7 @@ def test_odd_names_come_through(kind: str, rig: list[str], tmp_path: Path) -> No
         reads = string.Template(made["camera"]["volumes"][-1]["source"]).substitute()
     else:
         made = {one["metadata"]["name"]: one for one in yaml.safe_load_all(files["fieldpose.yaml"])
-                if one["kind"] == "Deployment"}  # fmt: skip
+                if one["kind"] in ("Deployment", "Job")}  # fmt: skip
         args = made["recorder"]["spec"]["template"]["spec"]["containers"][0]["args"]
         # As Kubernetes does, for which $(X) is a variable.
         words = [re.sub(r"(?<!\$)\$\((\w+)\)", "unknown", word).replace("$$", "$") for word in args]
@@ -283,7 +354,9 @@ def test_kubernetes_manifests_are_of_their_schemas_and_find_their_secrets(rig: l
     for one in made:
         validator.validate(one, "1.32", strict=True)
     there = {(one["kind"], one["metadata"]["name"]) for one in made}
-    for pod in (one["spec"]["template"]["spec"] for one in made if one["kind"] == "Deployment"):
+    pods = [one["spec"]["template"]["spec"] for one in made if one["kind"] in ("Deployment", "Job")]
+    assert len(pods) == 16
+    for pod in pods:
         (container,) = pod["containers"]
         assert {mount["name"] for mount in container["volumeMounts"]} == {volume["name"] for volume in pod["volumes"]}
         assert pod["securityContext"]["runAsNonRoot"]

@@ -78,16 +78,16 @@ def test_a_kernel_is_compiled_anew_once_what_it_shares_changes(tmp_path: Path, m
 
 def test_kernels_are_cached_where_something_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A file stands where a folder would have to be, which stops even root."""
-    package, home, temporary = tmp_path / "package", tmp_path / "home", tmp_path / "temporary"
+    given, package, home, temporary = (tmp_path / name for name in ("given", "package", "home", "temporary"))
     for folder in (package, home, temporary):
         folder.mkdir()
     (package / "kernel.py").write_text("X = 1\n")
-    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(given))
     monkeypatch.setenv("XDG_CACHE_HOME", str(home))
     monkeypatch.setattr(kernel_cache.tempfile, "gettempdir", lambda: str(temporary))
     own = temporary / f"fieldpose-{os.getuid()}"
     found = []
-    for blocked in (package / "__pycache__", home / "fieldpose", own, None):
+    for blocked in (given, package / "__pycache__", home / "fieldpose", own, None):
         kernel_cache._is_writable.cache_clear()
         found.append(cache_folder(package))
         if blocked is not None:
@@ -95,7 +95,7 @@ def test_kernels_are_cached_where_something_can_be_written(tmp_path: Path, monke
             blocked.write_text("")
     kernel_cache._is_writable.cache_clear()
     places = [None if folder is None else folder.parent for folder in found]
-    assert places == [package / "__pycache__", home / "fieldpose", own, None]
+    assert places == [given, package / "__pycache__", home / "fieldpose", own, None]
 
 
 def test_a_folder_that_others_may_write_to_is_not_trusted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

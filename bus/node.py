@@ -70,13 +70,10 @@ def run_nodes(
             node.announce()
         # Settled first, for a recorder that runs already is to get this process's very first message, and to know it.
         bus.settle(SETTLE_S)
-        # The last to be called back, and so the first: what is closed is not to be interrupted.
-        closing.callback(setattr, signals, "interrupting", False)
         with suppress(Interrupted, EndOfInput):
-            signals.interrupting = True
-            for node in nodes:
-                node.start(signals.stop)
-            signals.interrupting = False
+            with signals.raising():
+                for node in nodes:
+                    node.start()
             if not signals.stop.is_set():
                 _open(nodes, bus)
                 _serve(nodes, arrived, signals.stop)
@@ -150,10 +147,9 @@ class _Node:
         """Tell who sends from here."""
         self._announced = self._outbox.announce()
 
-    def start(self, stop: threading.Event) -> None:
+    def start(self) -> None:
         self._send_stats(ready=False)
-        if not stop.is_set():
-            self._handler.start()
+        self._handler.start()
 
     def listen(self) -> None:
         joins = isinstance(self._handler, JoinedHandler)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Annotated
 
@@ -47,11 +47,15 @@ class _Word(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Presence:
-    """The tokens held on the bus as the session `name` knows them; `send` reaches every session that has a link."""
+    """The tokens held on the bus as the session `name` knows them.
 
-    def __init__(self, name: str, send: Callable[[bytes], None]) -> None:
+    send: reaches every session that has a link; peers: the names of these.
+    """
+
+    def __init__(self, name: str, send: Callable[[bytes], None], peers: Callable[[], Iterable[str]]) -> None:
         self._name = name
         self._send = send
+        self._peers = peers
         self._changed = threading.Condition(threading.RLock())
         self._mine: list[str] = []
         self._changes = 0
@@ -109,6 +113,7 @@ class Presence:
         while True:
             self._send(self._word(number) + b" " * (_IMAGE_BYTES if images else 0))
             with self._changed:
+                self._note_links()
                 left_s = deadline - time.monotonic()
                 self._changed.wait_for(lambda: self._closed or self._answered(number), pause_s)
                 if self._closed or self._answered(number):
@@ -117,19 +122,15 @@ class Presence:
                 return False
             pause_s = min(2 * pause_s, _PAUSES_S[1])
 
-    def linked(self, peer: str) -> None:
-        """A link to `peer` came up: learn what it holds."""
-        with self._changed:
-            self._answers.setdefault(peer, 0)
-        self._greet_soon()
+    def links_changed(self) -> None:
+        """Links came up or ended: learn what the new ones hold, and forget what those hold that are gone.
 
-    def lost(self, peer: str) -> None:
-        """The link to `peer` ended, and with it what it held."""
+        Which did is asked, not told: where this process gets no time, its threads hear of two events in any order.
+        """
         with self._changed:
-            self._answers.pop(peer, None)
-            self._theirs.pop(peer, None)
-            self._tell()
-            self._changed.notify_all()
+            came, gone = self._note_links()
+        if came or not gone:
+            self._greet_soon()
 
     def heard(self, peer: str, payload: bytes) -> None:
         """Take in what another session said, and answer a greeting; what cannot be understood is passed over."""
@@ -140,7 +141,9 @@ class Presence:
         except (msgspec.DecodeError, UnicodeDecodeError):
             return
         with self._changed:
-            # Where the link is gone, or not known yet, there is nothing to note: its coming up asks again.
+            if peer not in self._answers:
+                self._note_links()
+            # Where the link is gone there is nothing to note.
             if peer in self._answers:
                 if peer not in self._theirs or word.changes >= self._theirs[peer].changes:
                     self._theirs[peer] = word
@@ -159,6 +162,19 @@ class Presence:
             self._changed.notify_all()
         if greeter is not None:
             greeter.join()
+
+    def _note_links(self) -> tuple[set[str], set[str]]:
+        """The peers that came and that are gone since the last time."""
+        peers = set(self._peers())
+        came, gone = peers - self._answers.keys(), self._answers.keys() - peers
+        for peer in gone:
+            del self._answers[peer]
+            self._theirs.pop(peer, None)
+        self._answers.update(dict.fromkeys(came, 0))
+        if gone:
+            self._tell()
+            self._changed.notify_all()
+        return came, gone
 
     def _may_answer(self, peer: str) -> bool:
         """A bucket for each name, from which an answer takes one and which time fills; and one for all names."""

@@ -12,6 +12,8 @@ from fieldpose.bus.topics import Address, Topic
 from fieldpose.errors import FieldposeError, TransportError
 
 SETTLE_S = 2.0
+_MOST_SETTLE_S = 20.0
+"""Somebody else on the bus, who does not answer, holds nobody up for longer."""
 
 Sink = Callable[[str, bytes, int], None]
 """Takes (key, payload, time of receipt in ns); is called from the bus's own threads and returns at once."""
@@ -124,7 +126,8 @@ def wait_for(bus: Bus, address: Address, stages: Iterable[str], timeout_s: float
     finally:
         watching.close()
     if ready:
-        bus.settle(max(SETTLE_S, deadline - time.monotonic()))
+        if wanted:
+            bus.settle(min(max(SETTLE_S, deadline - time.monotonic()), _MOST_SETTLE_S))
         return
     raise TransportError(f"not ready on the bus after {timeout_s:g} s: {missing}; is each of them running?")
 

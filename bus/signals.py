@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -15,13 +17,13 @@ class Interrupted(BaseException):
 class StopSignals:
     """In the main thread, SIGTERM and SIGINT set `stop` while the context lasts, and a second one sets `again`.
 
-    While `interrupting` is true they also raise Interrupted, out of whatever the main thread is doing.
+    While `raising` lasts the first also raises Interrupted, out of whatever the main thread is doing.
     """
 
     def __init__(self, stop: threading.Event | None = None) -> None:
         self.stop = stop or threading.Event()
         self.again = threading.Event()
-        self.interrupting = False
+        self._raising = False
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> StopSignals:
@@ -34,7 +36,19 @@ class StopSignals:
         for number, before in self._before.items():
             signal.signal(number, before)
 
+    @contextmanager
+    def raising(self) -> Iterator[None]:
+        """Raises Interrupted also for a signal that came before; what is closed after it is not interrupted."""
+        self._raising = True
+        try:
+            if self.stop.is_set():
+                raise Interrupted
+            yield
+        finally:
+            self._raising = False
+
     def _caught(self, number: int, frame: FrameType | None) -> None:
         (self.again if self.stop.is_set() else self.stop).set()
-        if self.interrupting:
+        if self._raising:
+            self._raising = False
             raise Interrupted

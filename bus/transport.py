@@ -181,13 +181,12 @@ class ZenohBus:
             except zenoh.ZError as error:
                 raise TransportError(f"cannot send on the bus: {zenoh_reason(error)}") from error
 
-        presence = Presence(name, say)
+        presence = Presence(name, say, lambda: map(str, self._session.info.peers_zid()))
         self.subscribe("peers/*", lambda key, payload, _: presence.heard(key.rsplit("/", 1)[1], payload), 256)
 
         def changed(event: Any) -> None:
             if event.transport.whatami == zenoh.WhatAmI.PEER:
-                up = event.kind == zenoh.SampleKind.PUT
-                (presence.linked if up else presence.lost)(str(event.transport.zid))
+                presence.links_changed()
 
         events = self._session.info.declare_transport_events_listener(changed, history=True)
         self._mine.append(Closer(events.undeclare))

@@ -188,7 +188,7 @@ def _for_systemd(out: Path, site: Site) -> list[str]:
         f"{out}: *.service and *.target to /etc/systemd/system, fieldpose-sysusers.conf to /etc/sysusers.d,"
         " config/* and hub.env to /etc/fieldpose, on every host; in hub.env stands where the hub is",
         _fields(site, FIELDS),
-        "fieldpose certs certs --hosts …: of the roles that a host runs, to /var/lib/fieldpose/certs",
+        f"fieldpose certs certs --hosts …: of the roles that a host runs, to {systemd.CERTIFICATES}, of root alone",
         f"then systemd-sysusers; systemctl daemon-reload; systemctl enable {systemd.TARGET} and those that the host"
         f" is to run; systemctl start {systemd.TARGET}",
     ]

@@ -6,6 +6,7 @@ import dataclasses
 import os
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +16,7 @@ import tyro
 from fieldpose.bus.logs import stage_logger
 from fieldpose.bus.node import Handler, run_nodes
 from fieldpose.bus.refusals import log_to_stderr
+from fieldpose.bus.signals import Interrupted, StopSignals
 from fieldpose.bus.transport import LOCAL_HUB, serve_hub, wait_for
 from fieldpose.deploy.access.joining import Entry, access_as, check_kept_out, hub_keys, joint
 from fieldpose.deploy.graph import (
@@ -154,17 +156,22 @@ def _serve(options: Options, row: Process, make: Callable[[Parts, Launch], Handl
     # The camera waits for the stages once it is at work; those that listen are to get its very first message.
     first = awaited if row.name != CAMERA else tuple(name for name in awaited if name.rpartition("/")[2] not in STAGES)
 
-    try:
-        record = None if options.record is None else with_start(options.record)
-        launch = Launch(bus, record, options.recording, plans, wait_until_ready)
-        # A recorder is one for all.
-        those = each[:1] if row.name == RECORDER else each
+    record = None if options.record is None else with_start(options.record)
+    launch = Launch(bus, record, options.recording, plans, wait_until_ready)
+    # A recorder is one for all.
+    those = each[:1] if row.name == RECORDER else each
+    with ExitStack() as closing, StopSignals() as signals, suppress(Interrupted):
+        closing.callback(bus.close)
         handlers = [(make(parts, launch), parts.settings.address) for parts in those]
-        way.wait(bus, _START_S)
-        wait_for(bus, address, first, _START_S)
-        run_nodes(handlers, bus)
-    finally:
-        bus.close()
+        with ExitStack() as unused:
+            # A recorder has begun its file already.
+            for handler, _ in handlers:
+                unused.callback(handler.stop)
+            with signals.raising():
+                way.wait(bus, _START_S)
+                wait_for(bus, address, first, _START_S)
+            unused.pop_all()
+        run_nodes(handlers, bus, signals.stop)
 
 
 def _served(options: Options, row: Process) -> list[tuple[Plan, Field | None]]:

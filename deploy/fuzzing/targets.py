@@ -82,8 +82,7 @@ def _wire() -> list[Target]:
 
 
 def _hear(data: bytes) -> None:
-    presence = Presence("me", lambda word: None)
-    presence.linked("other")
+    presence = Presence("me", lambda word: None, lambda: ["other"])
     try:
         presence.heard("other", data)
         presence.live("fieldpose/live/*/*/*")

@@ -7,7 +7,7 @@ import re
 from fieldpose.deploy.graph import HUB
 from fieldpose.deploy.hosts.services import CACHE, FIELDS, PORT, STATE, Service, Site
 
-_CERTIFICATES = f"{STATE}/certs"
+CERTIFICATES = "/etc/fieldpose/certs"
 _HUB = "${FIELDPOSE_HUB}"
 TARGET = "fieldpose.target"
 _WORD = re.compile(r"[^\s\"'\\;]+")
@@ -55,7 +55,7 @@ def unit_name(service: Service) -> str:
 
 def _unit(service: Service, site: Site, executable: str) -> str:
     environment = "\n".join(f"Environment={name}={value}" for name, value in service.environment.items())
-    keys = "\n".join(f"LoadCredential={name}:{_CERTIFICATES}/{name}" for name in service.certificates)
+    keys = "\n".join(f"LoadCredential={name}:{CERTIFICATES}/{name}" for name in service.certificates)
     words = service.command(_HUB, "%d", shared_memory=True)
     # In the program itself no variable is expanded.
     command = " \\\n  ".join([_quoted(executable, _PATH), *map(_quoted, words)])
@@ -94,7 +94,7 @@ def _given(service: Service) -> str:
     if service.writes:
         lines.append(f"StateDirectory={STATE.rpartition('/')[2]}")
     # /dev/shm stays shared; the certificates of others do not.
-    lines.append(f"InaccessiblePaths=-{_CERTIFICATES}")
+    lines.append(f"InaccessiblePaths=-{CERTIFICATES}")
     if service.with_fields:
         lines.append(f"ReadOnlyPaths={FIELDS}")
     if service.reads is not None:

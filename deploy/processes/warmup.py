@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -35,8 +34,18 @@ def compile_kernels(field: Path, jacobian: bool = False) -> None:
 
 @contextmanager
 def one_at_a_time() -> Iterator[None]:
-    """Hold this user's lock on compiling; the kernel lets go of it if the process dies."""
-    path = Path(tempfile.gettempdir()) / f"fieldpose-compiling-{os.getuid()}.lock"
-    with path.open("w") as file:
+    """Hold this user's lock on compiling into the cache; the kernel lets go of it if the process dies.
+
+    Where there is no cache, everybody compiles at once. The lock is beside what is compiled, for services and
+    containers may share a cache and no other folder.
+    """
+    from fieldpose.stages.kernel_cache import cache_folder
+    from fieldpose.stages.nerf import kernels
+
+    folder = cache_folder(Path(kernels.__file__).parent)
+    if folder is None:
+        yield
+        return
+    with (folder / f"compiling-{os.getuid()}.lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield

@@ -200,7 +200,7 @@ class TestJoined:
         failed = refusal(inbox)
         assert (failed.stage, failed.reason) == ("matching", Reason.FRAME_MISSING)
         assert (failed.header.frame_id, failed.header.pass_index) == (5, 1)
-        assert 0.08 < time.monotonic() - started < 2.0
+        assert time.monotonic() - started > 0.08
         assert inbox.get(0.05) is None
 
     def test_what_does_not_drive_is_never_answered(self, ends: tuple[Outbox, Inbox]) -> None:
@@ -610,9 +610,9 @@ class TestProcesses:
         process = spawn(STAGE, hub, start_s)
         assert process.stdout.readline() == "starting\n"
         if start_s == "0":
-            wait_for(connect(hub), ADDRESS, ["rendering"], 5.0)
+            wait_for(connect(hub), ADDRESS, ["rendering"], 30.0)
         process.send_signal(number)
-        out, err = process.communicate(timeout=5.0)
+        out, err = process.communicate(timeout=30.0)
         assert (process.returncode, out, err) == (0, "stopped\n", "")
 
     def test_killed_and_started_again(self, hub: str, connect: Connect, spawn: Spawn) -> None:
@@ -620,12 +620,12 @@ class TestProcesses:
         outbox = Outbox(bus, ADDRESS, "test")
         for frame_id in (1, 2):
             process = spawn(STAGE, hub, "0")
-            wait_for(bus, ADDRESS, ["rendering"], 10.0)
+            wait_for(bus, ADDRESS, ["rendering"], 30.0)
             outbox.publish(GUESS, guess(frame_id))
             assert [process.stdout.readline() for _ in range(2)] == ["starting\n", f"got {frame_id}\n"]
             process.kill()
             process.wait()
-            deadline = time.monotonic() + 2.0
+            deadline = time.monotonic() + 30.0
             while bus.live(ADDRESS.live("rendering")) and time.monotonic() < deadline:
                 time.sleep(0.01)
             assert bus.live(ADDRESS.live("rendering")) == set()

@@ -90,7 +90,9 @@ class TestLive:
         for frame_id in range(5):
             outbox.publish(FRAME, frame(frame_id))
             outbox.publish(TRUTH, truth(frame_id))
-            time.sleep(0.02)
+            deadline = time.monotonic() + 30
+            while recorder.messages <= frame_id and time.monotonic() < deadline:
+                time.sleep(0.001)
         assert not recorder.close()
         counts = {each.key.rsplit("/", 1)[-1]: each for each in info(path).sources}
         assert (counts["frame"].received, counts["frame"].written, counts["frame"].missing) == (5, 0, 0)

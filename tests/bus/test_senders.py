@@ -158,7 +158,7 @@ def test_the_observer_counts_neither_strangers_nor_stages_that_are_others(bus: M
 
 def test_a_flood_of_greetings_is_answered_now_and_then() -> None:
     said: list[bytes] = []
-    mine = presence.Presence("me", said.append)
+    mine = presence.Presence("me", said.append, lambda: ())
     for number in range(5000):
         mine.heard(f"s{number}", b'{"held":[],"changes":0,"number":%d,"to":""}' % (number + 1))
     assert 100 < len(said) < 1500

@@ -288,6 +288,24 @@ def test_a_recorder_that_is_started_again_has_a_file_of_its_own(hub: str, tmp_pa
         assert all(re.fullmatch(r"run-\d{8}-\d{6}\.mcap", name) for name in made)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_recorder_that_is_stopped_before_a_hub_is_there_finishes_its_file(
+    number: signal.Signals, tmp_path: Path
+) -> None:
+    field, record = save_empty_field(tmp_path / "field.safetensors"), tmp_path / "run.mcap"
+    hub = f"tcp/127.0.0.1:{free_port()}"
+    line = command("stage", "recorder", "--connect", hub, "--open", "--field", field, "--record", record)
+    recorder = subprocess.Popen(line)
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob("run.mcap*")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    recorder.send_signal(number)
+    assert recorder.wait(timeout=30) == 0
+    assert [path.name for path in tmp_path.glob("run*")] == ["run.mcap"]
+    assert info(record).attachments
+
+
 def test_the_start_of_a_recorder_stands_in_its_files_name() -> None:
     at = time.strptime("2031-02-03 04:05:06", "%Y-%m-%d %H:%M:%S")
     assert with_start(Path("a/run-{start}.mcap"), at) == Path("a/run-20310203-040506.mcap")

@@ -34,7 +34,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_video_becomes_poses_and_what_is_there_is_not_done_again(video: Path, tmp_path: Path) -> None:
     out, told = tmp_path / "room", tmp_path / "told.json"
     given = ("start", video, "--out", out, "--minutes", "0.25", "--json", told)
-    first = fieldpose(*given, cwd=tmp_path, timeout_s=240)
+    first = fieldpose(*given, cwd=tmp_path, timeout_s=500)
     assert first.returncode == 0, first.stderr
     steps = json.loads(told.read_text())["steps"]
     assert [step["step"] for step in steps] == ["capture", "train"]
@@ -42,7 +42,7 @@ def test_a_video_becomes_poses_and_what_is_there_is_not_done_again(video: Path, 
     assert {"dataset", "field.safetensors", "field.mp4", "field.jpg", "start.json"} <= {p.name for p in out.iterdir()}
     assert "next: the same command with --on" in first.stdout
     learnt = (out / "field.safetensors").stat().st_mtime_ns
-    second = fieldpose(*given, "--on", video, cwd=tmp_path, timeout_s=240)
+    second = fieldpose(*given, "--on", video, cwd=tmp_path, timeout_s=500)
     assert second.returncode == 0, second.stderr
     steps = json.loads(told.read_text())["steps"]
     assert [(step["step"], step["seconds"] is None) for step in steps] == [

@@ -27,7 +27,7 @@ CUT_S, BACK_S = 5.0, 2.0
 BEFORE_S, AFTER_S = 2.0, 3.0
 FIRST_BYTES = 500_000
 SPEED, RATE_HZ = 0.6, 18.0
-START_S = 90.0
+START_S = 240.0
 USUAL_DEG = 0.1
 """On one host half of the demo's poses err by 0.04 degrees at most."""
 WRONG_DEG, WRONG = 1.0, 0.02

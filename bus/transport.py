@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -12,6 +11,7 @@ from typing import Any
 
 import zenoh
 
+from fieldpose.bus import shared_memory
 from fieldpose.bus.access import Access, Deed
 from fieldpose.bus.memory import MemoryBus
 from fieldpose.bus.presence import Presence
@@ -29,8 +29,6 @@ __all__ = [
 LOCAL_HUB = "tcp/127.0.0.1:7447"
 WITHOUT_SHARED_MEMORY = {"transport/shared_memory/enabled": False}
 _LOCAL_PEER = "tcp/127.0.0.1:0"
-_POOL_BYTES = 32 << 20
-"""A sender comes to use all of it before it uses any again; room for five full-HD images as pixels."""
 _QUESTIONS = 64
 _SIGNAL_S = 0.5
 _ASK_AGAIN_S, _LEAST_S = 0.05, 0.01
@@ -67,8 +65,6 @@ class ZenohBus:
             "connect/endpoints": [self._hub],
             **_PATIENT,
             "listen/endpoints": [checked_endpoint(listen)],
-            "transport/shared_memory/transport_optimization/pool_size": _POOL_BYTES,
-            "transport/shared_memory/transport_optimization/enabled": _shared_memory_fits(),
         }
         what = f"cannot use hub {hub} and listen on {listen}"
         self._session = open_session({**peer, **closing(access), **(settings or {})}, what)
@@ -246,7 +242,7 @@ def open_session(values: Mapping[str, Any], what: str) -> Any:
         "scouting/delay": 100,
         "transport/link/tx/lease": 2000,
         "transport/link/tx/queue/congestion_control/drop": _WAITS_US,
-        "transport/shared_memory/enabled": True,
+        **shared_memory.settings(),
     }
     config = zenoh.Config()
     try:
@@ -267,14 +263,6 @@ def checked_endpoint(text: str) -> str:
     if not _ENDPOINT.fullmatch(text):
         raise TransportError(f"{text!r} is no address of a hub; expected for instance {LOCAL_HUB}")
     return text
-
-
-def _shared_memory_fits() -> bool:
-    # Pools that outgrow /dev/shm (64 MB in many containers) end a process with SIGBUS; each sender has one.
-    try:
-        return shutil.disk_usage("/dev/shm").free >= 8 * _POOL_BYTES
-    except OSError:
-        return False
 
 
 def zenoh_reason(error: Exception) -> str:

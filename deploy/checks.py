@@ -15,12 +15,11 @@ from typing import Literal
 
 import psutil
 
+from fieldpose.bus import shared_memory
 from fieldpose.errors import FieldposeError
 from fieldpose.stages.cores import usable_cores
 
 _PACKAGES = ("torch", "kornia", "numba", "numpy", "opencv-python-headless", "eclipse-zenoh", "mcap", "supervisor")
-_SHARED_MEMORY = Path("/dev/shm")
-_SHARED_MEMORY_MB = 256
 _NEEDED_GB = 3.0
 _DEFAULT_PORT = 7447
 _ECHOES = 20
@@ -53,13 +52,12 @@ def machine() -> Iterator[Finding]:
     enough = memory.available / 2**30 >= _NEEDED_GB
     text = f"{memory.available / 2**30:.1f} of {memory.total / 2**30:.1f} GB free"
     yield Finding("memory", "ok" if enough else "warning", text, "" if enough else f"{_NEEDED_GB:g} GB are needed")
-    if not _SHARED_MEMORY.is_dir():
-        yield Finding("shared memory", "warning", "none", "images will go over TCP, three times slower")
+    hindrance = shared_memory.hindrance()
+    if hindrance is not None:
+        yield Finding("shared memory", "note", "images between processes go over TCP", hindrance)
         return
-    free_mb = shutil.disk_usage(_SHARED_MEMORY).free / 2**20
-    enough = free_mb >= _SHARED_MEMORY_MB
-    mend = "" if enough else f"images will go over TCP; give {_SHARED_MEMORY_MB} MB (docker: --shm-size)"
-    yield Finding("shared memory", "ok" if enough else "warning", f"{free_mb:.0f} MB free in {_SHARED_MEMORY}", mend)
+    free_mb = shutil.disk_usage(shared_memory.FOLDER).free / 2**20
+    yield Finding("shared memory", "ok", f"{free_mb:.0f} MB free in {shared_memory.FOLDER}")
 
 
 def packages() -> Iterator[Finding]:

@@ -38,7 +38,8 @@ def _service(service: Service, site: Site) -> dict[str, Any]:
         "user": _USER,
         # Peers listen on ports of their own choice, which other hosts must reach.
         "network_mode": "host",
-        **({"ipc": "host"} if site.shared_memory else {}),
+        # Shared memory is locked: by a sender its own, by a receiver that of all that it hears.
+        **({"ipc": "host", "ulimits": {"memlock": -1}} if site.shared_memory else {}),
         "init": True,
         "read_only": True,
         "tmpfs": ["/tmp"],

@@ -80,6 +80,8 @@ Restart=on-failure
 RestartSec=1
 TimeoutStopSec={service.stop_s:g}
 MemoryMax={service.memory_mb}M
+# Shared memory is locked: by a sender its own, by a receiver that of all that it hears.
+LimitMEMLOCK=infinity
 User=fieldpose
 {_given(service)}
 {_HARDENING}

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import signal
 import subprocess
+import sys
+import textwrap
 import threading
 import time
 from collections.abc import Callable
@@ -14,6 +17,7 @@ from typing import TypeVar
 import pytest
 from support.bus_samples import ADDRESS, every_message, failure, frame, guess, same, truth
 
+from fieldpose.bus import shared_memory
 from fieldpose.bus.ports import Inbox, Outbox
 from fieldpose.bus.topics import ALL, BY_NAME, FAILURE, FRAME, GUESS, STATS, TRUTH, Address, topic_of
 from fieldpose.bus.transport import Bus, MemoryBus, ZenohBus, serve_hub, wait_for
@@ -267,6 +271,13 @@ def pools_of_this_process() -> set[str]:
     return {path for path in mapped if Path(path).exists() and Path(path).stat().st_size >= 16 << 20}
 
 
+CLAIMS = """
+    from fieldpose.bus import shared_memory
+    settings = shared_memory.settings()
+    assert "may lock 4 MB of memory; allow 1024" in shared_memory.hindrance()
+    print(settings["transport/shared_memory/enabled"],
+          settings["transport/shared_memory/transport_optimization/enabled"])
+"""
 HUB = "import sys; from fieldpose.bus.transport import serve_hub; serve_hub(sys.argv[1])"
 
 
@@ -331,6 +342,29 @@ class TestProcesses:
         Outbox(sender, ADDRESS, "camera").publish(FRAME, frame(0, width=480, height=360))
         assert inbox.get(5.0) is not None
         assert pools_of_this_process() <= before
+
+    @pytest.mark.parametrize("limited", ["sender", "receiver"])
+    def test_images_pass_where_one_may_not_lock_memory(
+        self, hub: str, connect: Connect, monkeypatch: pytest.MonkeyPatch, limited: str
+    ) -> None:
+        """Zenoh loses what a receiver cannot lock; a limit that lets it lock a pool or two is the worst."""
+        made = {}
+        for name in ("sender", "receiver"):
+            allowed = 64 << 20 if name == limited else float("inf")
+            monkeypatch.setattr(shared_memory, "lockable_bytes", lambda allowed=allowed: allowed)
+            made[name] = connect(hub)
+        inbox = Inbox(made["receiver"], ADDRESS, [FRAME])
+        meet(made["sender"], made["receiver"])
+        Outbox(made["sender"], ADDRESS, "camera").publish(FRAME, frame(0, width=480, height=360))
+        assert inbox.get(20.0) is not None
+
+    @pytest.mark.skipif(shutil.which("setpriv") is None or os.getuid() != 0, reason="only root can give up a right")
+    def test_those_who_may_lock_little_say_that_they_have_no_shared_memory(self) -> None:
+        limit = f"import resource; resource.setrlimit(resource.RLIMIT_MEMLOCK, ({4 << 20}, {4 << 20}))\n"
+        without = ["setpriv", "--bounding-set=-ipc_lock", "--inh-caps=-ipc_lock", sys.executable, "-c"]
+        program = limit + textwrap.dedent(CLAIMS)
+        done = subprocess.run([*without, program], capture_output=True, text=True, timeout=60)
+        assert (done.returncode, done.stdout) == (0, "False False\n"), done.stderr
 
     def test_two_hubs_on_one_port_is_one_clear_line(self, hub: str) -> None:
         with pytest.raises(TransportError, match=r"no hub at .* in use") as caught:

@@ -145,7 +145,10 @@ def test_containers_that_share_memory_have_one_dev_shm(tmp_path: Path, capsys: p
     field = str(save_empty_field(tmp_path / "field.safetensors"))
     arguments = [field, "--source", "bus", "--shared-memory"]
     made = yaml.safe_load(written("compose", tmp_path / "site", *arguments)["compose.yaml"])["services"]
-    assert all(one["ipc"] == "host" and "--no-shared-memory" not in one["command"] for one in made.values())
+    assert all(
+        one["ipc"] == "host" and one["ulimits"]["memlock"] == -1 and "--no-shared-memory" not in one["command"]
+        for one in made.values()
+    )
     assert CAMERA not in made
     assert main(["deploy", "kubernetes", str(tmp_path / "pods"), *arguments]) == 2
     assert "pods do not share /dev/shm" in capsys.readouterr().err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -14,16 +15,18 @@ from fieldpose.bus.messages import CameraOrigin, Encoding, Prior, State
 from fieldpose.bus.ports import Inbox, Outbox, first_header
 from fieldpose.bus.requests import ControlValues, Request, Reset, SetGuess, SetSolving, Show, TakeKeyframe
 from fieldpose.bus.topics import PRIOR, STATE, Address
-from fieldpose.bus.transport import LOCAL_HUB, Closing
+from fieldpose.bus.transport import LOCAL_HUB, Closing, wait_for
 from fieldpose.deploy.access.joining import NO_ENTRY, Entry, join
 from fieldpose.deploy.access.roles import PROGRAM
-from fieldpose.errors import ConfigError, GeometryError
+from fieldpose.errors import ConfigError, GeometryError, TransportError
 from fieldpose.stages.camera.wire import frame_messages
 from fieldpose.stages.geometry import RIGID_TOLERANCE, Camera, is_rigid
 from fieldpose.stages.images import checked_image
 
 _POLL_S = 0.1
 _KEPT_STATES = 1024
+_MEETING_S = 3.0
+"""Tracking is waited for so long, and may come later."""
 
 
 class Connection:
@@ -38,6 +41,9 @@ class Connection:
         self._bus, self._address = join(hub, entry, roles, timeout_s, coming_s=0.0), address
         try:
             self._states = Inbox(self._bus, address, (STATE,), {STATE: _KEPT_STATES})
+            # The hub answers before there is a link to anybody else, without which the first frame would be lost.
+            with suppress(TransportError):
+                wait_for(self._bus, address, ["tracking"], min(timeout_s, _MEETING_S))
             self._bus.settle(timeout_s, images=True)
         except BaseException:
             self._bus.close()
@@ -70,6 +76,8 @@ class Connection:
             checked_image(image)
         if self._announced is None:
             self._announced = self._outbox.announce()
+            # Who has not heard of it yet would take the frame for a stranger's.
+            self._bus.settle(_MEETING_S)
         frame_id = self._frames if frame_id is None else frame_id
         self._frames = frame_id + 1
         header = first_header(frame_id, time.time_ns() if capture_ns is None else capture_ns)

@@ -47,9 +47,9 @@ def test_it_is_pinned_as_everything_else_is() -> None:
 def test_it_has_the_folders_that_services_are_given() -> None:
     final = stages()[-1]
     assert all(folder in final for folder in (STATE, CACHE, CONFIG, FIELDS))
-    owned = re.search(r"install -d -o fieldpose -g fieldpose (.*) \\", final)
-    assert owned is not None
-    assert owned[1].split() == [STATE, CACHE]
+    written = re.search(r"install -d -m 1777 (.*) \\", final)
+    assert written is not None
+    assert written[1].split() == [STATE, CACHE]
 
 
 def test_what_it_copies_is_let_through_and_there() -> None:

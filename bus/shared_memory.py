@@ -14,14 +14,16 @@ from typing import Any
 FOLDER = Path("/dev/shm")
 _POOL_BYTES = 32 << 20
 """A sender comes to use all of it before it uses any again; room for five full-HD images as pixels."""
-_SENDERS = 32
+_LEAST_LOCKED_BYTES = 32 * _POOL_BYTES
+"""The pools of more senders than a host has cores for."""
+_LEAST_FREE_BYTES = 8 * _POOL_BYTES
 _CAP_IPC_LOCK = 14
 
 
 def settings() -> dict[str, Any]:
     """Zenoh's, by path, of a process that may be limited in what it locks, or find little room."""
     return {
-        "transport/shared_memory/enabled": lockable_bytes() >= _SENDERS * _POOL_BYTES,
+        "transport/shared_memory/enabled": lockable_bytes() >= _LEAST_LOCKED_BYTES,
         "transport/shared_memory/transport_optimization/enabled": hindrance() is None,
         "transport/shared_memory/transport_optimization/pool_size": _POOL_BYTES,
     }
@@ -31,13 +33,13 @@ def hindrance() -> str | None:
     """Why images of this process go over TCP, and what would mend it; None where they do not."""
     if not FOLDER.is_dir():
         return f"there is no {FOLDER}"
-    lockable, needed_mb = lockable_bytes(), _SENDERS * _POOL_BYTES >> 20
-    if lockable < _SENDERS * _POOL_BYTES:
+    lockable, free = lockable_bytes(), free_bytes()
+    if lockable < _LEAST_LOCKED_BYTES:
+        needed_mb = _LEAST_LOCKED_BYTES >> 20
         return f"this user may lock {lockable / 2**20:.0f} MB of memory; allow {needed_mb} (ulimit -l, LimitMEMLOCK)"
     # Pools that outgrow it (64 MB in many containers) end a process with SIGBUS; each sender has one.
-    free, needed = _free_bytes(), 8 * _POOL_BYTES
-    if free < needed:
-        return f"{FOLDER} has {free / 2**20:.0f} MB free; give it {needed >> 20} (docker: --shm-size)"
+    if free < _LEAST_FREE_BYTES:
+        return f"{FOLDER} has {free / 2**20:.0f} MB free; give it {_LEAST_FREE_BYTES >> 20} (docker: --shm-size)"
     return None
 
 
@@ -61,7 +63,8 @@ def _may_lock_all() -> bool:
     return bool(int(held, 16) >> _CAP_IPC_LOCK & 1)
 
 
-def _free_bytes() -> int:
+def free_bytes() -> int:
+    """The room in FOLDER; 0 where that cannot be told."""
     try:
         return shutil.disk_usage(FOLDER).free
     except OSError:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-import shutil
 import socket
 import statistics
 import time
@@ -56,8 +55,7 @@ def machine() -> Iterator[Finding]:
     if hindrance is not None:
         yield Finding("shared memory", "note", "images between processes go over TCP", hindrance)
         return
-    free_mb = shutil.disk_usage(shared_memory.FOLDER).free / 2**20
-    yield Finding("shared memory", "ok", f"{free_mb:.0f} MB free in {shared_memory.FOLDER}")
+    yield Finding("shared memory", "ok", f"{shared_memory.free_bytes() / 2**20:.0f} MB free in {shared_memory.FOLDER}")
 
 
 def packages() -> Iterator[Finding]:

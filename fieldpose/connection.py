@@ -71,6 +71,7 @@ class Connection:
         """Send a frame: (h, w, 3) uint8 RGB, or the bytes (n,) uint8 of a jpeg or png file. Returns its number.
 
         camera: of this image. capture_ns: when it was taken, since the epoch (default: now); motion is judged by it.
+        The first makes itself known on the bus, and waits for the answers of others, some milliseconds, at most 3 s.
         """
         if encoding == "rgb8":
             checked_image(image)

@@ -25,6 +25,7 @@ from fieldpose.errors import UsageError
 
 Kind = Literal["compose", "kubernetes", "systemd"]
 _MOST_CORES = 1024
+_OF_ONE_KIND: dict[str, Kind] = {"executable": "systemd", "namespace": "kubernetes"}
 _LABEL = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
 
 
@@ -94,6 +95,9 @@ class Options:
         """What is written. Raises UsageError, ConfigError and FieldFileError."""
         if not 1 <= self.cores <= _MOST_CORES:
             raise UsageError(f"--cores {self.cores}: expected 1 to {_MOST_CORES}")
+        for name, kind in _OF_ONE_KIND.items():
+            if self.kind != kind and getattr(self, name) != _default(name):
+                raise UsageError(f"--{name} is of {kind} alone, and {self.kind} was asked for; leave it out")
         if not self.executable.startswith("/"):
             raise UsageError(
                 f"--executable {self.executable}: expected the whole path that it has on the hosts, from /"

@@ -12,6 +12,7 @@ from fieldpose.errors import UsageError
 _HUB = f"tls/{HUB}:{PORT}"
 _CONFIG_MAP = "fieldpose-config"
 _PART_OF = {"app.kubernetes.io/part-of": "fieldpose"}
+_HUB_LABELS = {"app.kubernetes.io/name": HUB, **_PART_OF}
 _NODE_OF_CAMERA = "fieldpose/camera"
 _USER, _VIDEO = 1000, 44
 _READ_BY_GROUP = 0o440
@@ -71,7 +72,7 @@ def _claim(name: str, mode: str, size_gb: int) -> dict[str, Any]:
 
 def _service_of_hub() -> dict[str, Any]:
     ports = [{"name": "zenoh", "port": PORT, "targetPort": PORT, "protocol": "TCP"}]
-    spec = {"selector": {"app.kubernetes.io/name": HUB, **_PART_OF}, "ports": ports}
+    spec = {"selector": _HUB_LABELS, "ports": ports}
     return {"apiVersion": "v1", "kind": "Service", "metadata": {"name": HUB, "labels": _PART_OF}, "spec": spec}
 
 
@@ -79,11 +80,11 @@ def _network_policies() -> list[dict[str, Any]]:
     # Whatever else runs in the cluster has no business at their ports, though it would have no certificate either.
     own = {"podSelector": {"matchLabels": _PART_OF}}
     # Hubs of other groups, which may be in namespaces of their own.
-    others = {"namespaceSelector": {}, "podSelector": {"matchLabels": {"app.kubernetes.io/name": HUB, **_PART_OF}}}
+    others = {"namespaceSelector": {}, "podSelector": {"matchLabels": _HUB_LABELS}}
     port = [{"port": PORT, "protocol": "TCP"}]
     return [
         _policy("fieldpose", _PART_OF, {"from": [own]}),
-        _policy("fieldpose-hubs", {"app.kubernetes.io/name": HUB, **_PART_OF}, {"from": [others], "ports": port}),
+        _policy("fieldpose-hubs", _HUB_LABELS, {"from": [others], "ports": port}),
     ]
 
 

@@ -26,7 +26,7 @@ PORT = 7447
 EVERYWHERE = f"tls/0.0.0.0:{PORT}"
 _NOT_IN_NAMES = re.compile(r"[^a-z0-9]+")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
-MEMORY_MB = 2048
+_MEMORY_MB = 2048
 """Far above what a process uses, for a limit is to save the host from one that has gone wrong."""
 _MORE_S = 5.0
 _SOURCES_OF_FILES = ("folder", "dataset", "video", "mcap", "bag")
@@ -47,7 +47,7 @@ class Service:
     device: str | None = None
     reads: str | None = None
     writes: bool = False
-    memory_mb: int = MEMORY_MB
+    memory_mb: int = _MEMORY_MB
 
     @property
     def environment(self) -> dict[str, str]:
@@ -182,7 +182,7 @@ def _services(member: Member, files: tuple[str, str], plans: Sequence[Plan], wis
 
 def _recording(recorder: Service, wishes: Wishes) -> Service:
     kept = () if wishes.record is None else ("--record", str(_at_each_start(_below_state(wishes.record, "--record"))))
-    options, needed_mb = wishes.recording, MEMORY_MB
+    options, needed_mb = wishes.recording, _MEMORY_MB
     if options.snapshots is not None:
         options = replace(options, snapshots=_below_state(options.snapshots, "--record.snapshots"))
         needed_mb += options.most_memory_mb

@@ -23,9 +23,10 @@ from support.tracking_world import on_sphere, ring_of_views
 import fieldpose
 from fieldpose.bus.messages import Control, State, TrackingState
 from fieldpose.bus.node import run_node
+from fieldpose.bus.ports import Inbox
 from fieldpose.bus.reading import info, read_recording
 from fieldpose.bus.requests import Reset, SetGuess, SetSolving, Show, TakeKeyframe
-from fieldpose.bus.topics import CONTROL, Address
+from fieldpose.bus.topics import CONTROL, FRAME, Address
 from fieldpose.bus.transport import ZenohBus, serve_hub, wait_for
 from fieldpose.deploy.cli import main, parse
 from fieldpose.deploy.commands import control
@@ -233,6 +234,27 @@ class Sender:
             if state.state is TrackingState.TRACKING:
                 return state
         raise AssertionError("not found")
+
+
+def test_the_first_frame_reaches_tracking_that_is_met_only_after_the_hub(hub: str) -> None:
+    """Links between peers come up after the hub's answer, on a busy machine long after."""
+    late: list[tuple[ZenohBus, Inbox]] = []
+
+    def come() -> None:
+        bus = ZenohBus(hub)
+        late.append((bus, Inbox(bus, Address(), [FRAME])))
+        bus.hold(Address().live("tracking"))
+
+    coming = threading.Timer(0.5, come)
+    coming.start()
+    with fieldpose.connect(hub, open=True) as pipeline:
+        number = pipeline.publish(np.zeros((48, 64, 3), np.uint8), Camera(64, 48, 60.0, 60.0, 31.5, 23.5))
+        coming.join()
+        ((bus, inbox),) = late
+        received = inbox.get(10.0)
+    bus.close()
+    assert received is not None
+    assert received.message.header.frame_id == number
 
 
 @pytest.mark.slow

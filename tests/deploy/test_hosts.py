@@ -167,8 +167,8 @@ def test_containers_that_share_memory_have_one_dev_shm(tmp_path: Path, capsys: p
         (["--record", "/data/run.mcap"], "--record /data/run.mcap: services write below /var/lib/fieldpose alone"),
         (["--record", "../run.mcap"], "--record ../run.mcap: services write below /var/lib/fieldpose alone"),
         (["--record.snapshots", "/tmp"], "--record.snapshots /tmp: services write below /var/lib/fieldpose alone"),
-        (["--executable", "fieldpose"], "--executable fieldpose: expected the whole path that it has on the hosts"),
-        (["--namespace", "My_robots"], "--namespace My_robots: expected small letters, digits and hyphens"),
+        (["--executable", "/opt/fieldpose"], "--executable is of systemd alone, and compose was asked for"),
+        (["--namespace", "cell-2"], "--namespace is of kubernetes alone, and compose was asked for"),
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(
@@ -179,6 +179,26 @@ def test_mistakes_are_one_line_and_leave_nothing(
     assert main(["deploy", "compose", str(tmp_path / "site"), field, *source, *arguments]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert said in line
+    assert not (tmp_path / "site").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "arguments", "said"),
+    [
+        ("systemd", ["--executable", "fieldpose"], "--executable fieldpose: expected the whole path"),
+        (
+            "kubernetes",
+            ["--namespace", "My_robots"],
+            "--namespace My_robots: expected small letters, digits and hyphens",
+        ),
+    ],
+)
+def test_what_is_of_one_kind_alone_is_checked(
+    kind: str, arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    field = str(save_empty_field(tmp_path / "field.safetensors"))
+    assert main(["deploy", kind, str(tmp_path / "site"), field, "--source", "camera:0", *arguments]) == 2
+    assert said in capsys.readouterr().err
     assert not (tmp_path / "site").exists()
 
 
@@ -277,7 +297,8 @@ def test_odd_names_come_through(kind: str, rig: list[str], tmp_path: Path) -> No
     film, record = """/films/it's 50% of $HOME $(A) "a" \\ ;#b.mp4""", "/var/lib/fieldpose/$(X) 1%.mcap"
     field = save_empty_field(tmp_path / "$a 'b'.safetensors")
     executable = "/opt/$x 1%/fieldpose"
-    odd = [str(field), "--source", f"video:{film}", "--record", record, "--executable", executable]
+    odd = [str(field), "--source", f"video:{film}", "--record", record]
+    odd += ["--executable", executable] if kind == "systemd" else []
     files = written(kind, tmp_path / "site", *odd)
     named = {"/srv/fieldpose/fields/$a 'b'.safetensors", "/var/lib/fieldpose/$(X) 1%-{start}.mcap"}
     if kind == "systemd":
